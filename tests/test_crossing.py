@@ -294,4 +294,7 @@ def test_kinds_that_do_not_exist_are_refused_before_anything_is_graded(runs: tup
     line = refused(
         runs[0], "play", *ROUGH, "--device", "cpu", "--eval", "--set", "terrain.terrain_proportions={stair_up: 1}"
     )
-    assert "no kind of terrain 'stair_up' in terrain.terrain_proportions; did you mean 'stairs_up'" in line
+    assert (
+        "terrain.terrain_proportions: no kind of terrain 'stair_up' in the table of kinds; did you mean 'stairs_up'"
+        in line
+    )

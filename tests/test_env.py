@@ -294,7 +294,7 @@ class _Number(LeggedRobot):
             None,
             ModelError,
             r"^asset\.imu_site: 'FR' is on body 'FR_calf', which moves against the root 'trunk' by joint 'FR_calf_joint', so what it "
-            r"senses is not the root's; take a site or body that is fixed to the root, or hold that joint by asset\.held_joints$",
+            r"senses is not the root's; take a site or body that is fixed to the root, or hold that joint by held_joints$",
         ),
         (
             {"asset.imu_site": "imo"},
@@ -306,7 +306,7 @@ class _Number(LeggedRobot):
             {"asset.foot_names": ["FR", "FL", "RR", "RX"]},
             None,
             ModelError,
-            r"^asset.foot_names or foot_geoms: 'RX': no geom or body 'RX' in go1\.xml; there are: geoms .*, RL; bodies trunk, .*, RL_calf$",
+            r"^asset.foot_names or foot_geoms: no geom or body 'RX' in go1\.xml; there are: geoms .*, RL; bodies trunk, .*, RL_calf$",
         ),
         (
             {"asset.file": ""},
@@ -330,7 +330,7 @@ class _Number(LeggedRobot):
             {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},
             None,
             ModelError,
-            r"^terrain\.tile_size 7\.77 must be a whole number of cells \(terrain\.horizontal_scale\) of 0\.\d+ m",
+            r"^terrain\.tile_size: 7\.77 m must be a whole number of cells of 0\.\d+ m",
         ),
         (
             {"rewards.pose_weights": {"hip": 1.0, "thigh": 1.0}},

@@ -184,7 +184,7 @@ def test_shapes_and_their_probes() -> None:
     model = ball_model(None)
     model.geom_type[1] = kinds.mjGEOM_HFIELD
     with pytest.raises(
-        ModelError, match=r"^geom 'ball' is a hfield: its surface is not known as points, .* or take `engine` = mujoco$"
+        ModelError, match=r"^geom 'ball' is a hfield: its surface is not known as points, .* or take the engine mujoco$"
     ):
         probes(model, 0)
 
@@ -288,7 +288,7 @@ def test_too_little_room_is_seen() -> None:
     )
     sim.qpos[:, 2] = 0.099
     sim.step()
-    assert "raise `nconmax` (now 1)" in sim.overflow_report()
+    assert "raise nconmax (now 1)" in sim.overflow_report()
 
 
 @pytest.mark.parametrize("kind", ["rough_slope", "stairs_up"])

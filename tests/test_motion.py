@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from legged_mw import ROOT
-from legged_mw.envs.loading import load_robot
+from legged_mw.envs.robot_task import load_robot
 from legged_mw.motion.__main__ import feet_of, main
 from legged_mw.motion.foreign import breadth_first, read_motion
 from legged_mw.motion.look import page
@@ -29,7 +29,7 @@ AXIS = np.array([0.6, 0.0, 0.8])
 
 @pytest.fixture(scope="module")
 def g1() -> RobotModel:
-    return load_robot(load_task("g1_track").cfg, "servo", "mujoco", None, [], {})
+    return load_robot(load_task("g1_track").cfg, "servo", "mujoco")
 
 
 def steady(fps: float = 30.0, frames: int = 31) -> Clip:

@@ -215,7 +215,7 @@ def test_a_law_in_code_has_gains_delays_and_a_curve() -> None:
     drawn = {"domain_rand.stiffness": [0.5, 1.5], "domain_rand.delay_ms": [8.0, 8.0], "domain_rand.enable": True}
     env = make_env(2, {**DC, **nothing, **drawn, "control.actuator": "servo"}, env_class=Springs)
     assert torch.equal(env.p_gains, 35.0 * env.domain_rand.values["stiffness"]) and env.d_gains.tolist() == [0.5] * 12
-    assert (env.robot.tables["`stall_torque`"], env.robot.tables["`no_load_speed`"]) == ([20.0] * 12, [25.0] * 12)
+    assert (env.robot.tables["stall_torque"], env.robot.tables["no_load_speed"]) == ([20.0] * 12, [25.0] * 12)
     arrived: list[Tensor] = []
     env.actuators._compute = lambda actions: arrived.append(actions.clone()) or torch.zeros_like(actions)
     env.step(torch.full((2, 12), 0.5))

@@ -339,7 +339,7 @@ def test_names_do_not_run_into_each_other(
         (["a.png", "--set", "terrain.num_rows=0"], "terrain.num_rows is 0; it must be 1 or more"),
         (
             ["a.png", "--set", "terrain.terrain_proportions={moon: 1}"],
-            "no kind of terrain 'moon' in terrain.terrain_proportions",
+            "terrain.terrain_proportions: no kind of terrain 'moon' in the table of kinds",
         ),
     ],
 )

@@ -105,7 +105,7 @@ class DomainRand:
     written = ("_draws", "gravity_dir")
 
     def __init__(self, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation, law: str = "") -> None:
-        self._substep_ms, self._curves = 1e3 * cfg.sim.dt, "`stall_torque`" in robot.tables
+        self._substep_ms, self._curves = 1e3 * cfg.sim.dt, "stall_torque" in robot.tables
         self._sim, self._mask = sim, torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
         kinds = active(cfg, law)
         again = [name for name in kinds if name in cfg.domain_rand.redraw_at_reset]

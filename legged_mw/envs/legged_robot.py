@@ -23,7 +23,7 @@ from legged_mw.envs.robot_task import RobotTask, need, not_sensed
 from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.height_map import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners, opposites
-from legged_mw.sim.model import upright
+from legged_mw.sim.model import RobotModel, upright
 from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, command_table
@@ -365,6 +365,12 @@ class LeggedRobot(RobotTask):
                 f"{type(self).__name__} walks by command: it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}"
             )
         return build_terrain(self.cfg)
+
+    def _load_robot(self, engine: str) -> RobotModel:
+        try:
+            return super()._load_robot(engine)
+        except ModelError as error:
+            raise error.renamed({"sites": "asset.foot_names or foot_geoms"}) from None
 
     def _sensed_geoms(self) -> list[str]:
         """Feet first."""

@@ -62,11 +62,11 @@ def motor_gains(cfg: RobotTaskCfg, law: str) -> tuple[Mapping[str, float], Mappi
     return stiffness, control.damping or none
 
 
-def motor_curves(cfg: RobotTaskCfg, law: str) -> dict[str, Mapping[str, float]]:
+def motor_curves(cfg: RobotTaskCfg, law: str) -> Mapping[str, Mapping[str, float]]:
     """The tables of the torque-speed curve, by the simulator's names for them; none without a curve."""
     control = cfg.control
     tables = {"stall_torque": control.stall_torque, "no_load_speed": control.no_load_speed, "gear": control.gear}
-    return {f"`{name}`": table for name, table in tables.items()} if has_curve(cfg, law) else {}
+    return tables if has_curve(cfg, law) else {}
 
 
 def factor_fields(cfg: RobotTaskCfg, law: str) -> dict[str, tuple[str, ...]]:
@@ -133,9 +133,7 @@ class Actuators:
         scale = robot.tables["control.action_scale"]
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], [rad/s] or [N m]
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
-        self._gains = {
-            name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")
-        }
+        self._gains = {name: torch.tensor(robot.tables[name], device=sim.device) for name in ("stiffness", "damping")}
         by_angle = law not in ("torque", OWN) and self._origin != "speed"
         self.encoder_offset = drawn.get("encoder_offset")  # (N, D) [rad], measured minus true angle
         self._offset = self.encoder_offset if by_angle else None

@@ -15,7 +15,7 @@ Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property, reduce
 from typing import Any, ClassVar
@@ -27,23 +27,30 @@ from torch import Tensor
 
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.domain_rand import DomainRand, check_draws, world_fields
-from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
-from legged_mw.envs.motors import Actuators, make_delay, own_law
+from legged_mw.envs.motors import Actuators, make_delay, motor_curves, motor_drive, motor_gains, own_law
 from legged_mw.envs.observations import Observations, Row, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Divergence, Statistics, Suspects
-from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.joints import PARTIAL
 from legged_mw.sim.mirror import Partners, find_partners
-from legged_mw.sim.model import RobotModel
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, standing_height
 from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT, SENSORS
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import StepError, place_of, unknown
+from legged_mw.utils.errors import ModelError, StepError, place_of, unknown
+from legged_mw.utils.files import find_file
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
+
+FIELDS = {  # parameter of build_model, or table of it -> the field that it comes from
+    **{name: f"control.{name}" for name in ("stiffness", "damping", "stall_torque", "no_load_speed", "gear")},
+    **{name: f"asset.{name}" for name in ("imu_site", "colliders", "held_joints", *PARTIAL)},
+    "pose": "init_state.default_joint_angles",
+    "contact_geoms": "asset.penalize_contacts_on or terminate_after_contacts_on",
+}
 
 
 class RobotTask(BaseTask):
@@ -57,7 +64,6 @@ class RobotTask(BaseTask):
     # term -> what is sensed for it where it is on; `asset.sense` names more
     SENSED_FOR: ClassVar[Mapping[str, str]] = {"self_collision": SELF_CONTACT, "angular_momentum": ANGULAR_MOMENTUM}
 
-    @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
         """Each line needs those above it.
 
@@ -545,7 +551,11 @@ class RobotTask(BaseTask):
         self.default_dof_pos = self._tensor(self.robot.pose)
         self.pose_weights = self._tensor(self.robot.tables["rewards.pose_weights"])
         self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
-        self.soft_lower, self.soft_upper = soft_limits(self.robot, cfg.rewards.soft_dof_pos_limit, self.device)
+        # `soft_dof_pos_limit` of each joint's range, about its middle; infinite where it has no limits
+        middle = (self.joint_lower + self.joint_upper) / 2
+        half = (self.joint_upper - self.joint_lower) / 2 * cfg.rewards.soft_dof_pos_limit
+        self.soft_lower = torch.where(half.isfinite(), middle - half, self.joint_lower)
+        self.soft_upper = torch.where(half.isfinite(), middle + half, self.joint_upper)
         self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]
         self.init_pos = self._tensor(self.start_place)
         self.reset_range = self._tensor(
@@ -784,6 +794,67 @@ class RobotTask(BaseTask):
             "asset.self_collisions is False, so that parts pass through one another",
         )
         return self.self_contacts[:, 0].clone()
+
+
+def load_robot(
+    cfg: RobotTaskCfg,
+    law: str,
+    engine: str,
+    terrain: Terrain | None = None,
+    contact_geoms: Sequence[str] = (),
+    sites: Mapping[str, Sequence[str]] = {},
+    more_sensors: Collection[str] = (),
+) -> RobotModel:
+    """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
+    asset, scale = cfg.asset, cfg.control.action_scale
+    stiffness, damping = motor_gains(cfg, law)
+    if not asset.file:
+        raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
+    try:
+        return build_model(
+            find_file(cfg, "asset.file"),
+            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
+            ground=Ground(
+                cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope
+            ),
+            stiffness=stiffness,
+            damping=damping,
+            colliders=asset.colliders,
+            self_collisions=asset.self_collisions,
+            contact_geoms=contact_geoms,
+            velocity_sites=list(sites),
+            imu_site=asset.imu_site,
+            sites=sites,
+            pose=cfg.init_state.default_joint_angles,
+            tables={
+                "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
+                "rewards.pose_weights": cfg.rewards.pose_weights,
+                **motor_curves(cfg, law),
+                "rewards.deviation_weights": cfg.rewards.deviation_weights,
+            },
+            held_joints=asset.held_joints,
+            partial={name: getattr(asset, name) for name in PARTIAL},
+            more_sensors=more_sensors,
+            drive=motor_drive(cfg, law),
+        )
+    except ModelError as error:
+        raise error.renamed(FIELDS) from None
+
+
+def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
+    """x, y, z of the root [m]: the config's; or with its feet as high above the ground as in the keyframe; or with the lowest foot on it.
+
+    Without feet it is the lowest of the ``colliders``.
+    """
+    if cfg.init_state.pos:
+        return list(cfg.init_state.pos)
+    feet = [geom for geoms in robot.site_geoms.values() for geom in geoms]
+    feet = feet or robot.names.find(colliders, "asset.colliders", colliding=True)
+    if robot.keyframe is None or robot.keyframe.height is None:
+        return [0.0, 0.0, standing_height(robot, feet, robot.pose)]
+    read = tuple(robot.keyframe.angles[name] for name in robot.joint_names)
+    lower = 0.0 if read == robot.pose else standing_height(robot, feet, read) - standing_height(robot, feet, robot.pose)
+    return [0.0, 0.0, robot.keyframe.height - lower]
 
 
 def check_term(method: Callable[[], Any], count: int) -> Tensor:

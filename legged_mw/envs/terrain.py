@@ -11,27 +11,36 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.terrain import Terrain, make_terrain
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.math import assign
 
+FIELDS = {  # parameter of make_terrain -> the field that it comes from
+    "proportions": "terrain.terrain_proportions",
+    "columns": "terrain.num_cols",
+    "tile": "terrain.tile_size",
+    "cell": "terrain.horizontal_scale",
+}
 
-@in_config_words()
+
 def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
     """The ground that the section terrain describes; None: a plane."""
     ground = cfg.terrain
     if ground.mesh_type == "plane":
         return None
-    return make_terrain(
-        levels=ground.num_rows,
-        difficulty=(ground.difficulty[0], ground.difficulty[1]),
-        proportions=ground.terrain_proportions,
-        columns=ground.num_cols,
-        tile=ground.tile_size,
-        cell=ground.horizontal_scale,
-        border=ground.border_size,
-        seed=ground.seed,
-    )
+    try:
+        return make_terrain(
+            levels=ground.num_rows,
+            difficulty=(ground.difficulty[0], ground.difficulty[1]),
+            proportions=ground.terrain_proportions,
+            columns=ground.num_cols,
+            tile=ground.tile_size,
+            cell=ground.horizontal_scale,
+            border=ground.border_size,
+            seed=ground.seed,
+        )
+    except ModelError as error:
+        raise error.renamed(FIELDS) from None
 
 
 class Tiles:

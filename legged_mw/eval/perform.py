@@ -14,13 +14,13 @@ import torch
 from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.wording import say_overflow
 from legged_mw.eval import exam, skill_page
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
 from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill, Starts
 from legged_mw.eval.skills import make_skill
 from legged_mw.rl.students.recurrent import forget
+from legged_mw.sim.simulation import say_overflow
 from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask, load_task

@@ -17,9 +17,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.wording import say_overflow
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget, with_own_state
+from legged_mw.sim.simulation import say_overflow
 
 Policy = Callable[[TensorDict], Tensor]  # one with a memory is an rsl-rl network
 Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_mw.envs.loading import load_robot
+from legged_mw.envs.robot_task import load_robot
 from legged_mw.motion.foreign import CSV_FPS, read_motion
 from legged_mw.motion.look import ClipStage, page
 from legged_mw.sim.model import RobotModel
@@ -50,7 +50,7 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     args = parse()
     cfg, file = load_task(args.task, say=True).cfg, Path(args.file)
-    robot = load_robot(cfg, "servo", "mujoco", None, [], {})
+    robot = load_robot(cfg, "servo", "mujoco")
     clip = convert(read_motion(file, robot, args.fps), args)
     print(page(robot, clip, feet_of(robot)))
     if args.out:

@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import Watch
-from legged_mw.envs.wording import config_words
 from legged_mw.rl.checkpoint import check_resume
 from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
@@ -285,10 +284,8 @@ class Runner(OnPolicyRunner):
         drawn = curves(numbers, losses, speed, collect, learn, report.total_steps)
         self._draw_curves({**drawn, "Train/undone_updates": float(self._health.undone)}, report.iteration)
         if numbers["overflowed"] and not self._warned_overflow:
-            others = (
-                f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
-            )
-            print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)
+            others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise nconmax and njmax"
+            print(f"WARNING: {self.env.sim.overflow_report() or others}", flush=True)
             self._warned_overflow = True
 
     def _stored_names(self) -> list[str]:

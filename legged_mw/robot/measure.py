@@ -249,7 +249,7 @@ def what_joints_bear(robot: RobotModel, matrices: dict[str, FloatArray], torque:
                     robot.speed_limits[i],
                     float(model.dof_armature[dof]),
                 ),
-                *(robot.tables["`stiffness`"][i], robot.tables["`damping`"][i]),
+                *(robot.tables["stiffness"][i], robot.tables["damping"][i]),
                 *(float(free[pose][dof]), pose, float(matrices["default"][dof, dof]), float(torque[i])),
             )
         )
@@ -260,8 +260,8 @@ def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:
     """What a substep does to all joints together, in the air, from the mass ``matrix`` (V, V)."""
     model, size = robot.physics, len(matrix)
     dt = float(model.opt.timestep)
-    stiffness = np.diag([0.0] * 6 + [*(np.array(robot.tables["`stiffness`"]) + model.jnt_stiffness[1:])])
-    damping = np.diag([0.0] * 6 + robot.tables["`damping`"])
+    stiffness = np.diag([0.0] * 6 + [*(np.array(robot.tables["stiffness"]) + model.jnt_stiffness[1:])])
+    damping = np.diag([0.0] * 6 + robot.tables["damping"])
     left, right = (matrix + dt * damping, matrix) if implicit else (matrix, matrix - dt * damping)
     onto_x, onto_v = np.linalg.solve(left, -dt * stiffness), np.linalg.solve(left, right)
     step = np.block([[np.eye(size) + dt * onto_x, dt * onto_v], [onto_x, onto_v]])

@@ -92,7 +92,7 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
         notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
         if lean > UPRIGHT:
             text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
-            notes.append(f"{text}begins upright: state a pose for that by `pose`")
+            notes.append(f"{text}begins upright: state a pose for that")
     for key in keys:
         if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")

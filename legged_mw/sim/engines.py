@@ -23,12 +23,12 @@ _SHARE = {"mujoco": 0.2, "mujoco_warp": 1.0}
 def pick_engine(asked: str, device: str) -> str:
     """The engine that ``asked`` means on ``device``: "auto" is MuJoCo's own on a CPU and mujoco-warp on a GPU."""
     if asked not in ENGINES:
-        raise EngineError(unknown("engine", asked, ENGINES, "`engine`"))
+        raise EngineError(unknown("engine", asked, ENGINES, "the list of engines"))
     if asked == "auto":
         return "mujoco" if device == "cpu" else "mujoco_warp"
     if asked == "mujoco" and device != "cpu":
         raise EngineError(
-            f"`engine` = mujoco steps on a CPU, and the device is {device}; take the device cpu, or the engine mujoco_warp"
+            f"the engine mujoco steps on a CPU, and the device is {device}; take the device cpu, or the engine mujoco_warp"
         )
     return asked
 
@@ -60,9 +60,9 @@ def make_simulation(
         counted = count_capacity(model, terrain is not None)
         nconmax, njmax = nconmax or counted.contacts, njmax or counted.rows
         world += 4 * (njmax * (model.nv + 10) + nconmax * 30)
-        room = f" with `nconmax` = {nconmax}, `njmax` = {njmax}"
+        room = f" with nconmax = {nconmax}, njmax = {njmax}"
     require_memory(
-        num_envs * world, device, f"`num_envs` = {num_envs}", f"a world takes {in_bytes(world)}{room}; take fewer"
+        num_envs * world, device, f"num_envs = {num_envs}", f"a world takes {in_bytes(world)}{room}; take fewer"
     )
     # each engine is imported where it steps: importing warp takes a second
     if kind == "mujoco":

@@ -20,7 +20,7 @@ def match_joints(joints: Sequence[str], patterns: Sequence[str], what: str) -> l
     """The joints that names or patterns mean, in the order of ``joints``."""
     for pattern in patterns:
         if not any(fnmatchcase(joint, pattern) for joint in joints):
-            raise ModelError(f"{what}: {unknown('joint', pattern, joints, 'the MJCF')}")
+            raise ModelError.of((what, unknown("joint", pattern, joints, "the MJCF")))
     return [joint for joint in joints if any(fnmatchcase(joint, pattern) for pattern in patterns)]
 
 
@@ -35,9 +35,8 @@ def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str,
         joint = spec.joint(name)
         body = joint.parent
         if (first := body.first_joint().name) != name and first not in angles:
-            raise ModelError(
-                f"`held_joints`: joint '{name}' moves together with '{first}' on body '{body.name}'; hold both of them, or neither"
-            )
+            together = f"joint '{name}' moves together with '{first}' on body '{body.name}'"
+            raise ModelError.of(("held_joints", f"{together}; hold both of them, or neither"))
         _place(body, *_pose_in_parent(model, data, body.name))
         spec.delete(joint)
         notes.append(f"joint '{name}' held at {angle:g} rad")
@@ -95,18 +94,18 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
         return _add_site(spec, root, name, np.zeros(3), f"at the origin of '{root}'", notes)
     if not is_site and spec.body(name) is None:
         known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
-        raise ModelError(f"`imu_site`: {unknown('site or body', name, known, where)}")
+        raise ModelError.of(("imu_site", unknown("site or body", name, known, where)))
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     base, there = data.body(root), data.site(name) if is_site else data.body(name)
     body = model.body(model.site_bodyid[there.id] if is_site else there.id)
     if beyond := _what_moves(model, root, body.id):
         if asked:
-            raise ModelError(
-                f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the "
-                "root, or hold that joint by `held_joints`"
+            instead = "take a site or body that is fixed to the root, or hold that joint by held_joints"
+            raise ModelError.of(
+                ("imu_site", f"'{name}' is on {beyond}, so what it senses is not the root's; {instead}")
             )
-        why = f"at the origin of '{root}': '{name}' is on {beyond}; `imu_site` may name another"
+        why = f"at the origin of '{root}': '{name}' is on {beyond}; imu_site may name another"
         return _add_site(spec, root, f"{name}_root", np.zeros(3), why, notes)
     axes = base.xmat.reshape(3, 3).T
     turn = axes @ there.xmat.reshape(3, 3)

@@ -36,15 +36,13 @@ class GeomNames:
             hits += [geom for body in bodies for geom in self.bodies[body]]
             if bodies and not hits:
                 have = ", ".join(name for name, own in self.bodies.items() if own) or "none"
-                raise ModelError(
-                    f"{what}: body '{bodies[0]}' of {self.where} has no geom that collides; bodies that have: {have}"
-                )
+                why = f"body '{bodies[0]}' of {self.where} has no geom that collides; bodies that have: {have}"
+                raise ModelError.of((what, why))
             if not hits:
                 kind = "colliding geom or body" if colliding else "geom or body"
                 text = unknown(kind, pattern, [*geoms, *self.bodies], self.where).partition("there are: ")[0]
-                raise ModelError(
-                    f"{what}: {text}there are: geoms {', '.join(geoms) or 'none'}; bodies {', '.join(self.bodies)}"
-                )
+                known = f"geoms {', '.join(geoms) or 'none'}; bodies {', '.join(self.bodies)}"
+                raise ModelError.of((what, f"{text}there are: {known}"))
             found |= dict.fromkeys(hits)
         return tuple(found)
 

@@ -38,8 +38,8 @@ def some_joints(
     """
     for key in table:
         if key and not any(key in joint for joint in (*joints, *spare)):
-            raise ModelError(
-                f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)"
+            raise ModelError.of(
+                (what, f"{unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)")
             )
     found = {}
     for joint in joints:
@@ -48,8 +48,8 @@ def some_joints(
             continue
         *others, best = fitting
         if others and len(others[-1]) == len(best):
-            raise ModelError(
-                f"{what}: '{others[-1]}' and '{best}' fit joint '{joint}' equally well; add the key '{joint}'"
+            raise ModelError.of(
+                (what, f"'{others[-1]}' and '{best}' fit joint '{joint}' equally well; add the key '{joint}'")
             )
         found[joint] = float(table[best])
     return found
@@ -59,9 +59,8 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spar
     """Values (D,) for ``joints``. Raises ModelError for joints without a key, and as ``some_joints`` does."""
     found = some_joints(table, joints, what, spare)
     if without := [joint for joint in joints if joint not in found]:
-        raise ModelError(
-            f"{what}: no value for {', '.join(without)}: none of {list(table)} is a part of these names; add keys, or '' for all others"
-        )
+        missing = f"no value for {', '.join(without)}: none of {list(table)} is a part of these names"
+        raise ModelError.of((what, f"{missing}; add keys, or '' for all others"))
     return list(found.values())
 
 
@@ -69,14 +68,14 @@ def per_joint_all(
     tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()
 ) -> dict[str, list[float]]:
     """``per_joint`` of several tables (name -> table); one error lists what is wrong with all of them."""
-    values, wrong = dict[str, list[float]](), []
+    values, wrong = dict[str, list[float]](), list[tuple[str, str]]()
     for what, table in tables.items():
         try:
             values[what] = per_joint(table, joints, what, spare)
         except ModelError as error:
-            wrong.append(str(error))
+            wrong += error.wrong
     if wrong:
-        raise ModelError("; ".join(wrong))
+        raise ModelError.of(*wrong)
     return values
 
 
@@ -97,7 +96,7 @@ class PosedRobot:
     held: list[str]
     angles: list[float]  # D, the pose [rad]
     ranges: list[Range]  # D [rad]; infinite where there is no limit
-    # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], CURVE at the joint, and the caller's other tables
+    # D each: "stiffness" [N m/rad], "damping" [N m s/rad], CURVE at the joint, and the caller's other tables
     tables: dict[str, list[float]]
 
 
@@ -110,11 +109,11 @@ def pose_joints(
     Raises ModelError for joints that no key fits.
     """
     every = [joint.name for joint in robot.joints]
-    welded = match_joints(every, held, "`held_joints`")
+    welded = match_joints(every, held, "held_joints")
     moving = [name for name in every if name not in welded]
-    needed = {"`pose`": pose} if robot.keyframe is None and pose is not None else {}
+    needed = {"pose": pose} if robot.keyframe is None and pose is not None else {}
     values = per_joint_all({**tables, **needed}, moving, spare=welded)
-    known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
+    known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "pose")}
     model = robot.model
     if welded:
         # the angle nearest to 0
@@ -128,7 +127,7 @@ def pose_joints(
     for name, angle, (low, high) in zip(moving, angles, ranges, strict=True):
         if pose is not None and not low - _BEYOND <= angle <= high + _BEYOND:
             robot.notes.append(
-                f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad"
+                f"warning: in the pose {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad"
             )
     return PosedRobot(model, moving, welded, angles, ranges, values | curves_at_joints(values))
 
@@ -145,10 +144,10 @@ def set_machine(
 
     Returns the speed limits (D,) [rad/s], infinite where nothing states one.
     """
-    said = {what: some_joints(partial.get(what, {}), posed.joints, f"`{what}`", posed.held) for what in PARTIAL}
+    said = {what: some_joints(partial.get(what, {}), posed.joints, what, posed.held) for what in PARTIAL}
     set_efforts(robot.limits, said["effort"], robot.notes)
     set_joints(robot.joints, said["armature"], said["frictionloss"], robot.notes)
-    motors = map(Motor, *(posed.tables[name] for name in ("`stiffness`", "`damping`", *CURVE) if name in posed.tables))
+    motors = map(Motor, *(posed.tables[name] for name in ("stiffness", "damping", *CURVE) if name in posed.tables))
     add_motors(robot.spec, robot.joints, posed.ranges, list(motors), drive, robot.limits, robot.notes)
     speeds = (
         robot.speeds

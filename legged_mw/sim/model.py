@@ -131,19 +131,19 @@ def build_model(
     robot = read_file(file, more_sensors)
     spec, notes = robot.spec, robot.notes
     with naming(file):
-        posed = pose_joints(robot, {"`stiffness`": stiffness, "`damping`": damping, **tables}, pose, held_joints)
+        posed = pose_joints(robot, {"stiffness": stiffness, "damping": damping, **tables}, pose, held_joints)
         names = name_geoms(spec, robot.where, notes)
         imu = "" if imu_site is None else sensed_site(spec, posed.model, robot.root, imu_site, robot.where, notes)
         fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
         add_ground(spec, ground, notes)
-        _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
+        _set_collisions(spec, names.find(colliders, "colliders", colliding=True), self_collisions, notes)
         if self_collisions:
             _leave_out_neighbours(spec, posed.joints, posed.angles, notes)
         speeds = set_machine(robot, partial or {}, posed, drive)
-        made = {name: names.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
+        made = {name: names.find(geoms, "sites") for name, geoms in (sites or {}).items()}
         add_sites(spec, made, posed.angles, robot.where, notes)
-        touching = names.find(contact_geoms, "`contact_geoms`")
+        touching = names.find(contact_geoms, "contact_geoms")
         return _compile(robot, posed, names, ground, made, touching, velocity_sites, imu, speeds, more_sensors)
 
 
@@ -207,7 +207,7 @@ def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujo
 
 def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
     if solver.integrator not in _INTEGRATORS:
-        raise ModelError(unknown("integrator", solver.integrator, _INTEGRATORS, "`integrator`"))
+        raise ModelError(unknown("integrator", solver.integrator, _INTEGRATORS, "MuJoCo"))
     wanted = {
         "timestep": solver.timestep,
         "iterations": solver.iterations,

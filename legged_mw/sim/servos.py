@@ -17,8 +17,8 @@ from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIF
 Range = tuple[float, float]
 # what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]
 Drive = Literal["angle", "speed", "torque"]
-# tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]
-CURVE = ("`stall_torque`", "`no_load_speed`")
+# tables of motors with a torque-speed curve, before a "gear": [N m], [rad/s]
+CURVE = ("stall_torque", "no_load_speed")
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
 _NEVER, _ALWAYS = mujoco.mjtLimited.mjLIMITED_FALSE, mujoco.mjtLimited.mjLIMITED_TRUE
@@ -60,7 +60,7 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
 
 def curves_at_joints(tables: Mapping[str, list[float]]) -> dict[str, list[float]]:
     """Those of CURVE that ``tables`` has, at the joint: a motor's torque grows by its gear, its speed shrinks."""
-    gears = tables.get("`gear`", [])
+    gears = tables.get("gear", [])
     powers = {name: power for name, power in zip(CURVE, (1.0, -1.0), strict=True) if name in tables and gears}
     return {
         name: [value * gear**power for value, gear in zip(tables[name], gears, strict=True)]
@@ -154,7 +154,7 @@ def add_motors(
     ]
     if endless:
         notes.append(
-            f"warning: nothing limits the force of {', '.join(endless)}: these servos are stronger than any motor; set `effort`"
+            f"warning: nothing limits the force of {', '.join(endless)}: these servos are stronger than any motor; set effort"
         )
 
 

@@ -90,3 +90,16 @@ class Simulation(ABC):
     @abstractmethod
     def overflow_report(self) -> str:
         """A line about what overflowed since construction, or ''. Reads the device: not for inside a step."""
+
+
+def overflow_note(sim: Simulation, what: str) -> str:
+    """A warning that ``what`` is not to be trusted, if contacts or constraints of ``sim`` did not fit; else ''. Reads the device."""
+    report = sim.overflow_report()
+    return f"WARNING: {what} is not to be trusted: {report}" if report else ""
+
+
+def say_overflow(sim: Simulation, what: str) -> bool:
+    """Print that warning; returns whether there was one."""
+    if note := overflow_note(sim, what):
+        print(note, flush=True)
+    return bool(note)

@@ -33,7 +33,7 @@ def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points
         shape = str(kind).rsplit("_", 1)[-1].lower()
         raise ModelError(
             f"geom '{model.geom(geom).name}' is a {shape}: its surface is not known as points, as those of spheres, capsules, boxes, "
-            "cylinders, ellipsoids and meshes are. Give the MJCF one of those there, or take `engine` = mujoco"
+            "cylinders, ellipsoids and meshes are. Give the MJCF one of those there, or take the engine mujoco"
         )
     radius = float(size[0]) if kind in (_KINDS.mjGEOM_SPHERE, _KINDS.mjGEOM_CAPSULE) else 0.0
     return np.array(_POINTS[kind](size, spacing), dtype=float).reshape(-1, 3), radius

@@ -77,19 +77,18 @@ def make_terrain(
     """Build all tiles; difficulty rises in equal steps from level to level. Raises ModelError for what does not exist or fit."""
     for kind in proportions:
         if kind not in KINDS:
-            raise ModelError(unknown("kind of terrain", kind, KINDS, "`proportions`"))
+            raise ModelError.of(("proportions", unknown("kind of terrain", kind, KINDS, "the table of kinds")))
     n = round(tile / cell)
     if abs(n * cell - tile) > 1e-6 or tile < 4 * PLATFORM:
-        raise ModelError(
-            f"`tile` {tile:g} must be a whole number of cells (`cell`) of {cell:g} m, and at least {4 * PLATFORM:g} m"
+        raise ModelError.of(
+            ("tile", f"{tile:g} m must be a whole number of cells of {cell:g} m, and at least {4 * PLATFORM:g} m")
         )
     kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
     edge = round(border / cell)
     if (count := (columns * n + 2 * edge + 1) * (levels * n + 2 * edge + 1)) > MOST_HEIGHTS:
-        raise ModelError(
-            f"terrain: {levels} x {columns} tiles of {tile:g} m with a height every {cell:g} m have {count / 1e6:.0f} million heights, "
-            f"more than {MOST_HEIGHTS / 1e6:.0f}; raise `cell`, or lower `levels`, `columns`, `tile` or `border`"
-        )
+        many = f"{levels} x {columns} tiles of {tile:g} m with a height every {cell:g} m have {count / 1e6:.0f} million heights"
+        instead = f"take larger cells, fewer or smaller tiles, or less than {border:g} m around them"
+        raise ModelError.of(("cell", f"{many}, more than {MOST_HEIGHTS / 1e6:.0f}; {instead}"))
     field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
     origins = np.zeros((levels, columns, 3))
     corner = (-0.5 * levels * tile - edge * cell, -0.5 * columns * tile - edge * cell)
@@ -128,13 +127,11 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
     """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
     wanted = {kind: share for kind, share in proportions.items() if share > 0}
     if not wanted:
-        raise ModelError(
-            f"`proportions`: no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}"
-        )
+        none = f"no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}"
+        raise ModelError.of(("proportions", none))
     if len(wanted) > columns:
-        raise ModelError(
-            f"`columns`: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one"
-        )
+        few = f"{columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one"
+        raise ModelError.of(("columns", few))
     bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
     kinds = [
         list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)

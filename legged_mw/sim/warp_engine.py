@@ -140,9 +140,9 @@ class WarpSimulation(Simulation):
         bits = [bit for bit in OverflowType if bit != OverflowType.ALL and bool((seen & int(bit)).any())]
         raise_ = []
         if {OverflowType.NEFC, OverflowType.NJMAX_NNZ} & set(bits):
-            raise_.append(f"`njmax` (now {self.njmax})")
+            raise_.append(f"njmax (now {self.njmax})")
         if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
-            raise_.append(f"`nconmax` (now {self.nconmax})")
+            raise_.append(f"nconmax (now {self.nconmax})")
         if OverflowType.CONTACT_MATCH in bits:  # more contacts than one sensor takes in
             most = self._model.opt.contact_sensor_maxmatch
             raise_.append(f'<numeric name="contact_sensor_maxmatch" data="{2 * most}"/> in the MJCF (now {most})')

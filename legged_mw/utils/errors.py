@@ -8,7 +8,7 @@ import re
 import sysconfig
 import traceback
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -28,10 +28,22 @@ class ConfigError(UserError, TypeError):
 
 
 class ModelError(UserError, ValueError):
-    """A name or number asked of a robot's model that does not fit its file. In the text stand the called function's
+    """A name or number asked of a robot's model that does not fit its file; the message lists what exists."""
 
-    parameters in `backticks`, for a caller to write its own words there.
-    """
+    wrong: tuple[tuple[str, str], ...] = ()  # parameters of the called function, and what is wrong with each
+
+    @classmethod
+    def of(cls, *wrong: tuple[str, str]) -> ModelError:
+        """The error about parameters: ``parameter: what is wrong``, one after the other."""
+        error = cls("; ".join(f"{parameter}: {what}" for parameter, what in wrong))
+        error.wrong = wrong
+        return error
+
+    def renamed(self, names: Mapping[str, str]) -> ModelError:
+        """The same error with the names that a caller has for the parameters."""
+        if not self.wrong:
+            return self
+        return type(self).of(*((names.get(parameter, parameter), what) for parameter, what in self.wrong))
 
 
 class EngineError(UserError, ValueError):

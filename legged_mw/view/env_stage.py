@@ -13,9 +13,9 @@ from torch import Tensor
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.wording import say_overflow
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget
+from legged_mw.sim.simulation import say_overflow
 from legged_mw.sim.terrain import name_tile
 from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.commands import Command

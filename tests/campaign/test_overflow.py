@@ -9,16 +9,16 @@ import torch
 from program import SMALL
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.wording import overflow_note
 from legged_mw.eval import exam, perform, rollout
 from legged_mw.eval.page import Column, about
 from legged_mw.eval.rules import ExamRules
 from legged_mw.rl import export_replay
 from legged_mw.sim.mujoco_engine import MujocoSimulation
+from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.task import load_task
 from legged_mw.view.env_stage import EnvStage
 
-NOTE = "is not to be trusted: simulator overflow (NEFC) in 3 of 4 worlds; raise sim.njmax (now 1)"
+NOTE = "is not to be trusted: simulator overflow (NEFC) in 3 of 4 worlds; raise njmax (now 1)"
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def env(monkeypatch: pytest.MonkeyPatch) -> LeggedRobot:
     monkeypatch.setattr(
         MujocoSimulation,
         "overflow_report",
-        lambda _: "simulator overflow (NEFC) in 3 of 4 worlds; raise `njmax` (now 1)",
+        lambda _: "simulator overflow (NEFC) in 3 of 4 worlds; raise njmax (now 1)",
     )
     task = load_task("go1_flat")
     for item in SMALL[SMALL.index("--set") + 1 :: 2]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from golden.table import Run, Table
 from legged_mw import ROOT
-from legged_mw.envs.loading import load_robot
+from legged_mw.envs.robot_task import load_robot
 from legged_mw.motion.foreign import read_motion
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
@@ -22,7 +22,7 @@ WAVE = ROOT / "resources/motions/g1_wave.npz"
 
 @cache
 def g1() -> RobotModel:
-    return load_robot(load_task("g1_track").cfg, "servo", "mujoco", None, [], {})
+    return load_robot(load_task("g1_track").cfg, "servo", "mujoco")
 
 
 def clip() -> Clip:
