@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from legged_mw import ROOT
-from legged_mw.envs.statistics import Divergence, Watch
+from legged_mw.envs.statistics import BrokenWorlds, DivergenceStop
 from legged_mw.robot import __main__ as program
 from legged_mw.robot import picture
 from legged_mw.robot.draft import Draft, as_env, draft, table
@@ -494,7 +494,7 @@ def test_what_broke_a_world_is_counted() -> None:
         torch.zeros(5, 2),
         torch.zeros(5, dtype=torch.bool),
     )
-    found = Divergence(sim, actions, ["hip", "knee"], 100.0)  # pyright: ignore[reportArgumentType]
+    found = BrokenWorlds(sim, actions, ["hip", "knee"], 100.0)  # pyright: ignore[reportArgumentType]
     sim.qvel[:, 6:] = torch.tensor([1.0, 2.0])
     found.find(broken)
     assert not broken.any() and found.counts.tolist() == [0, 0, 0]
@@ -523,7 +523,7 @@ def numbers(
 
 
 def test_twice_in_a_row_over_one_percent() -> None:
-    watch = Watch()
+    watch = DivergenceStop()
     assert watch.verdict(numbers(2.0, hip=2.0)) == ""  # 1 % is not over 1 %
     assert watch.verdict(numbers(3.0, hip=5.0)) == ""
     assert watch.verdict(numbers(0.0, hip=5.0)) == ""
@@ -542,7 +542,7 @@ def test_twice_in_a_row_over_one_percent() -> None:
         and "set sim.integrator to implicitfast" in text
         and "--check --picture" in text
     )
-    policy = Watch()
+    policy = DivergenceStop()
     policy.verdict(numbers(9.0, action=9.0))
     assert "the policy's actions are not finite; lower algorithm.learning_rate" in policy.verdict(
         numbers(9.0, action=18.0)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from legged_mw.envs.motors import Delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.statistics import Suspects
+from legged_mw.envs.statistics import NonFinite
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import StepError, place_of, unknown
 from legged_mw.utils.machine import require_memory
@@ -127,9 +127,9 @@ class Observations:
             if part.histories:
                 part.fresh.logical_or_(mask)
 
-    def suspects(self) -> list[Suspects]:
+    def nonfinite(self) -> list[NonFinite]:
         """What counts values of rows that are not finite, a group each."""
-        return [part.suspects for part in self._parts.values()]
+        return [part.nonfinite for part in self._parts.values()]
 
     def remember(self) -> list[tuple[Tensor, Tensor]]:
         """Everything that ``compute`` changes, and copies of it."""
@@ -167,7 +167,7 @@ class Observations:
 class _Group:
     """One group: how its rows become a buffer."""
 
-    written = ("fresh", "frame", "buffer", "delay", "suspects")
+    written = ("fresh", "frame", "buffer", "delay", "nonfinite")
 
     def __init__(self, name: str, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
         noise = [row.noise * noise_level for row in rows for _ in range(row.value.shape[1])]
@@ -177,7 +177,7 @@ class _Group:
         self._scales = torch.tensor(scales, device=device) if any(scale != 1.0 for scale in scales) else None
         self._measured = torch.tensor([row.measured for row in rows for _ in range(row.value.shape[1])], device=device)
         self.delay: Delay | None = None
-        self.suspects = Suspects(
+        self.nonfinite = NonFinite(
             [f"observation row '{row.name}' of '{name}'" for row in rows for _ in range(row.value.shape[1])], device
         )
         self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
@@ -202,7 +202,7 @@ class _Group:
 
     def compute(self) -> None:
         torch.cat(self._values, dim=1, out=self.frame)
-        self.suspects.clear(self.frame)
+        self.nonfinite.clear(self.frame)
         if self._noise is not None:
             self.frame.addcmul_(torch.empty_like(self.frame).uniform_(-1.0, 1.0), self._noise)
         if self._scales is not None:

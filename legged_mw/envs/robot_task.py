@@ -32,7 +32,7 @@ from legged_mw.envs.motors import Actuators, make_delay, motor_curves, motor_dri
 from legged_mw.envs.observations import Observations, Row, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.statistics import Divergence, Statistics, Suspects
+from legged_mw.envs.statistics import BrokenWorlds, NonFinite, Statistics
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.joints import PARTIAL
 from legged_mw.sim.mirror import Partners, find_partners
@@ -173,7 +173,7 @@ class RobotTask(BaseTask):
 
     def check_termination(self) -> None:
         """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
-        self.divergence.find(self.broken)
+        self.broken_worlds.find(self.broken)
         torch.logical_and(self._fallen(), ~self.broken, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
         torch.logical_and(self._timed_out(), ~ended, out=self.time_out_buf)
@@ -374,7 +374,7 @@ class RobotTask(BaseTask):
         if self._reward_terms:
             terms = torch.stack([term() for term in self._reward_terms], dim=1).mul_(self.reward_scales)
             terms.masked_fill_(self.broken[:, None], 0.0)
-            self.suspects[0].clear(terms)
+            self.nonfinite[0].clear(terms)
             total = terms[:, : self._num_clipped].sum(dim=1)
             if rewards.only_positive_rewards:
                 total.clamp_(0.0, rewards.max_reward)
@@ -402,9 +402,9 @@ class RobotTask(BaseTask):
                 )
             check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
-        self.suspects = [
-            self.remember(Suspects([f"reward term '{n}'" for n in self.reward_names], self.device)),
-            *self.observations.suspects(),
+        self.nonfinite = [
+            self.remember(NonFinite([f"reward term '{n}'" for n in self.reward_names], self.device)),
+            *self.observations.nonfinite(),
         ]
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
@@ -419,7 +419,7 @@ class RobotTask(BaseTask):
 
     def _live_statistics(self) -> dict[str, Tensor]:
         """Values as they stand: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
-        worlds = {"overflowed": self.sim.overflowed_worlds(), **self.divergence.statistics()}  # so far
+        worlds = {"overflowed": self.sim.overflowed_worlds(), **self.broken_worlds.statistics()}  # so far
         return worlds | self.perturbation.statistics()
 
     def take_statistics(self) -> Tensor:
@@ -487,8 +487,8 @@ class RobotTask(BaseTask):
         self.joint_reading = self.dof_offset if exact else self.buffer(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self.buffer(dtype=torch.bool), self.buffer(dtype=torch.bool)
-        self.divergence = self.remember(
-            Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
+        self.broken_worlds = self.remember(
+            BrokenWorlds(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
         )
         # one matrix, so that a reset clears it in one go
         self._episode, views = columns(n, device, **self._episode_columns())

@@ -3,7 +3,7 @@
 Everything is added up on the device and read once an iteration. A reward or an observation that is NaN, infinite or absurdly
 large becomes 0 and is counted; what is as it should be keeps its bits. A state that is not finite ends an episode as "broken".
 One such world is an accident; many, step after step, are physics that cannot be stepped as the config has it, and a training in
-it must end. ``Watch`` decides that, on the host, once an iteration.
+it must end. ``DivergenceStop`` decides that, on the host, once an iteration.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Statistics:
         return named
 
 
-class Suspects:
+class NonFinite:
     """Looks at K values of N worlds, each of something that has a name."""
 
     written = ("counts",)
@@ -85,7 +85,7 @@ class Suspects:
         return counts
 
 
-class Divergence:
+class BrokenWorlds:
     """Finds broken worlds and counts, since the start, the fastest joint of each."""
 
     written = ("counts",)
@@ -110,7 +110,7 @@ class Divergence:
         return {name: self.counts[i] for i, name in enumerate([*(f"{JOINT}{joint}" for joint in self._joints), ACTION])}
 
 
-class Watch:
+class DivergenceStop:
     """Says when an iteration's statistics mean that a training must end."""
 
     def __init__(self) -> None:

@@ -16,12 +16,13 @@ class Health:
         """``names`` of the values that the step looks at, and of the ``stored`` columns that an update learns from; in words."""
         self._names, self._stored = names, stored
         self.undone = 0  # updates, in all
-        self._row, self._sick = 0, 0  # updates undone, and iterations with too many suspects, one after the other
+        self._row = 0  # updates undone, one after the other
+        self._sick = 0  # iterations with too many values that are not finite, one after the other
         self._heard = 0  # iterations of this process
         self._said: dict[str, float] = {}  # name -> count when it was said last
 
     def judge(self, counts: Sequence[float], steps: int, undone: bool, wrong: Sequence[float]) -> tuple[list[str], str]:
-        """Warnings, and why training must end, '' to go on; ``counts`` of suspects in ``steps`` steps of a world, ``wrong`` columns."""
+        """Warnings, and why training must end, '' to go on; ``counts`` of bad values in ``steps`` steps of a world, ``wrong`` columns."""
         found = self._by_name(counts)
         warnings = [line for name, count in found.items() if (line := self._warning(name, count, steps))]
         worst = max(found, key=lambda name: found[name], default="")

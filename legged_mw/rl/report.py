@@ -64,7 +64,7 @@ class Report(NamedTuple):
     total_steps: int  # since the beginning of training, over all ranks
     steps: int  # of this iteration, over all ranks
     losses: list[str]
-    message: Message  # statistics of the episodes, suspects, stop, room; losses, learning rate, std of the actions, undone, wrong columns
+    message: Message  # statistics of the episodes, nonfinite, stop, room; losses, learning rate, std of the actions, undone, wrong columns
     marks: tuple[Mark, Mark, Mark]  # begin, end of the rollout, end of the update
 
     def seconds(self) -> tuple[float, float]:

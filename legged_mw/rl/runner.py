@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.statistics import Watch
+from legged_mw.envs.statistics import DivergenceStop
 from legged_mw.rl.checkpoint import check_resume
 from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
@@ -63,11 +63,11 @@ class Runner(OnPolicyRunner):
         self.diverged = ""  # why training had to end, in words
         self.begins_anew = "it is a new run"
         self.keeper: Keeper | None = None  # writes checkpoints; made in `learn` where there is a folder
-        self._watch = Watch()
+        self._watch = DivergenceStop()
         recorded = getattr(self.alg, "graphed", False)
         self._undo: Undo = self.alg.undo if recorded else Undo(self.alg, self._networks().values())  # type: ignore[union-attr]
         self._settles = not recorded  # the recorded update undoes itself
-        self._health = Health([name for each in env.suspects for name in each.names], self._stored_names())
+        self._health = Health([name for each in env.nonfinite for name in each.names], self._stored_names())
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self.update_threads = (
@@ -232,7 +232,7 @@ class Runner(OnPolicyRunner):
         self.total_steps += steps
         asks = float(self.stop is not None), self.plan.room() if self.gpu_global_rank == 0 else 0.0
         taken = (
-            [each.take() for each in self.env.suspects],
+            [each.take() for each in self.env.nonfinite],
             [torch.full((1,), value, device=self.device) for value in asks],
         )
         parts = [self.env.take_statistics(), *map(torch.cat, taken)]
@@ -260,7 +260,7 @@ class Runner(OnPolicyRunner):
 
     def _log(self, report: Report) -> None:
         """One block on the console and one point a curve in the writer."""
-        statistics, suspects, (stop, room), lost, settings, (undone,), wrong = report.message.read()
+        statistics, nonfinite, (stop, room), lost, settings, (undone,), wrong = report.message.read()
         numbers = self.env.name_statistics(statistics)
         self._all_stop = stop > 0
         self.plan.hear(report.iteration, room)
@@ -276,7 +276,7 @@ class Runner(OnPolicyRunner):
         self.console.iteration(
             report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed
         )
-        warnings, verdict = self._health.judge(suspects, report.steps, undone > 0, wrong)
+        warnings, verdict = self._health.judge(nonfinite, report.steps, undone > 0, wrong)
         warnings += self._health.lengths(numbers)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:

@@ -19,7 +19,7 @@ from torch import nn
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Observations
-from legged_mw.envs.statistics import Suspects
+from legged_mw.envs.statistics import NonFinite
 from legged_mw.rl import ppo
 from legged_mw.rl.health import Health
 from legged_mw.rl.losses import value_loss
@@ -222,8 +222,8 @@ def test_an_update_is_undone_to_the_last_bit(value: float) -> None:
         assert alg.undo.undone == 0 and not alg.undo.wrong.any()
 
 
-def test_suspects_keep_what_is_good() -> None:
-    look = Suspects(["a", "b"], "cpu")
+def test_what_is_finite_keeps_its_bits() -> None:
+    look = NonFinite(["a", "b"], "cpu")
     values = torch.tensor([[1.0, math.nan], [-1e6, 1e7], [-0.0, math.inf], [3.0, -1e38]])
     kept = values[:, 0].clone()
     look.clear(values)
