@@ -27,7 +27,7 @@ from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, taught_worlds
-from legged_mw.rl.transfer import begin_with, load_teacher, seat_teacher
+from legged_mw.rl.transfer import attach_teacher_observations, begin_with, load_teacher
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
@@ -307,7 +307,7 @@ def test_it_teaches_a_student_that_reads_other_frames(frames: int, policy: Concu
         **{"observations.history": {"state": frames}, "observations.leave_out": {}, "actor.concurrent.groups": []}
     )
     env, teacher = LeggedRobot(task.cfg, "cpu"), find_trained(str(run_folder), run_folder.parent, "--teacher")
-    seat_teacher(env, teacher)
+    attach_teacher_observations(env, teacher)
     runner: Any = make_runner(env, task.train, None, "cpu", teacher.task.train)
     load_teacher(runner.alg.teacher, teacher, env)
     obs = env.get_observations()

@@ -353,7 +353,7 @@ def test_kicks_grow_between_two_shares_of_a_training(engine: str) -> None:
     env.perturbation._clock.fill_(5001.0)  # [control steps] in the middle of a kick of 200 s
     for done in (None, 0.0, 0.2, 0.3, 0.6, 1.0):
         if done is not None:
-            env.anneal(done)
+            env.on_training_progress(done)
         env.step(torch.zeros(1, env.num_actions))
         kicks.append(float(env.perturbation.kick_force.norm()))
     full = env.perturbation._mass * 2.0 / 2.0 / 200.0

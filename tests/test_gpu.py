@@ -27,7 +27,7 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.students.recurrent import memory_of
-from legged_mw.rl.transfer import seat_teacher
+from legged_mw.rl.transfer import attach_teacher_observations
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 
@@ -516,7 +516,7 @@ def test_a_recorded_warm_up_ends(networks: dict) -> None:
 
 def test_a_students_iteration_never_waits_for_the_host() -> None:
     env, teacher = make_env(eager=False), load_task("go1_flat")
-    seat_teacher(env, Trained(Source(Path(), Path("model_1.pt"), False), teacher))
+    attach_teacher_observations(env, Trained(Source(Path(), Path("model_1.pt"), False), teacher))
     runner = make_runner(env, small_learner(), None, DEVICE, teacher.train)
     runner.learn(5)
     obs = env.get_observations()

@@ -236,8 +236,8 @@ END_STEP = """
         {}  # here
 """
 ANNEAL = """
-    def anneal(self, done):
-        super().anneal(done)
+    def on_training_progress(self, share):
+        super().on_training_progress(share)
         {}  # here
 """
 LOAD = """
@@ -335,13 +335,13 @@ BREACHES: dict[str, tuple[str, str, str]] = {
         f"Mine._end_step: self.list[2] {MADE_ONCE}: self.list[2].copy_(...)",
     ),
     "number": (END_STEP, "self.count += 1", f"Mine._end_step: {NUMBER}"),
-    "number that a training changes": (ANNEAL, "self.count = 2.0 * done", f"Mine.anneal: {NUMBER}"),
+    "number that a training changes": (ANNEAL, "self.count = 2.0 * share", f"Mine.on_training_progress: {NUMBER}"),
     "number of the config that a training changes": (
         ANNEAL,
-        "self.cfg.rewards.base_height_target = 0.3 * done",
-        f"Mine.anneal: {NUMBER.replace('self.count', 'self.cfg.rewards.base_height_target')}",
+        "self.cfg.rewards.base_height_target = 0.3 * share",
+        f"Mine.on_training_progress: {NUMBER.replace('self.count', 'self.cfg.rewards.base_height_target')}",
     ),
-    "rebound by a training": (ANNEAL, "self.past = self.past + done", f"Mine.anneal: {PAST}"),
+    "rebound by a training": (ANNEAL, "self.past = self.past + share", f"Mine.on_training_progress: {PAST}"),
     "number that a redraw changes": (REDRAW, "self.count += 1", f"drawn: {NUMBER}"),
     "rebound by a checkpoint": (
         LOAD,

@@ -46,7 +46,7 @@ def test_a_snapshot_holds_all_that_a_step_writes(name: str, tmp_path: Path) -> N
     for action in actions[:4]:
         one.step(action)
         two.step(-action)
-        two.anneal(0.3)
+        two.on_training_progress(0.3)
     state, draws = take_snapshot(one), torch.get_rng_state()
     wanted = [one.step(action)[:3] for action in actions[4:]]
     assert put_snapshot(two, state) == ""

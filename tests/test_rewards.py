@@ -229,10 +229,10 @@ def test_tracking_sigma_goes_to_its_end_over_a_training() -> None:
     paint(env)
     squared = 0.62896507 * 0.25  # [m^2/s^2], as above
     for done, sigma in ((0.0, 0.25), (0.5, 0.15), (1.0, 0.05)):
-        env.anneal(done)
+        env.on_training_progress(done)
         assert env._reward_tracking_lin_vel()[0].item() == pytest.approx(math.exp(-squared / sigma), rel=1e-5)
     fixed = make_env(2, HAND)
-    fixed.anneal(1.0)
+    fixed.on_training_progress(1.0)
     assert fixed.tracking_sigma == 0.25 and not isinstance(fixed.tracking_sigma, torch.Tensor), (
         "no operation more than a number takes"
     )

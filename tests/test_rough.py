@@ -167,7 +167,7 @@ def test_a_command_below_the_smallest_asks_nothing() -> None:
     env = rough(2, rewards__min_command=0.2)
     env.commands[:] = torch.tensor([[0.15, 0.0, 0.0], [0.3, 0.0, 0.0]])
     env.step(STAND.expand(2, -1))
-    assert env.asked[:, 0].tolist() == [0.0, pytest.approx(0.006)] and env.progress[0] == 0.0
+    assert env.commanded_distance[:, 0].tolist() == [0.0, pytest.approx(0.006)] and env.progress[0] == 0.0
 
 
 def test_a_trunk_near_the_ground_is_a_fall() -> None:
@@ -196,7 +196,12 @@ def episode(
     fell: bool = False,
 ) -> None:
     """Write into the books that ``world`` had such an episode."""
-    env.asked[world], env.progress[world], env.farthest[world], env.asked_speed[world] = asked, progress, farthest, 1.0
+    env.commanded_distance[world], env.progress[world], env.max_distance[world], env.commanded_speed[world] = (
+        asked,
+        progress,
+        farthest,
+        1.0,
+    )
     env.episode_steps[world], env.fell[world] = round(seconds / env.dt), fell
 
 
@@ -241,14 +246,14 @@ def test_books_are_kept_along_the_command() -> None:
     env.commands[:] = torch.tensor([[1.0, 0.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, 1.0]])
     env.sim.qvel[:, 0] = 0.0
     env.step(STAND.expand(3, -1))
-    torch.testing.assert_close(env.asked[:, 0], torch.tensor([0.02, 0.01, 0.0]))
+    torch.testing.assert_close(env.commanded_distance[:, 0], torch.tensor([0.02, 0.01, 0.0]))
     along = torch.stack([env.base_lin_vel[0, 0], -env.base_lin_vel[1, 1], torch.tensor(0.0)]) * 0.02
     torch.testing.assert_close(env.progress[:, 0], along)
     away = (env.sim.qpos[:, :2] - env.tiles.origins[:, :2]).abs().amax(dim=1)  # type: ignore[union-attr]
-    torch.testing.assert_close(env.farthest[:, 0], away)
+    torch.testing.assert_close(env.max_distance[:, 0], away)
     env.sim.qpos[0, 0] = env.tiles.origins[0, 0]  # type: ignore[union-attr]
     env.step(STAND.expand(3, -1))
-    assert env.farthest[0, 0] >= away[0], "it remembers"
+    assert env.max_distance[0, 0] >= away[0], "it remembers"
 
 
 def test_without_the_curriculum_any_level_comes_at_each_reset() -> None:

@@ -22,9 +22,9 @@ from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import getup, handstand, strip
 from legged_mw.eval.perform import machine, on_ground
 from legged_mw.eval.skill import Ground, Recording, Robot
+from legged_mw.skills.drop_states import fallen
 from legged_mw.skills.getup import Getup
 from legged_mw.skills.handstand import Handstand
-from legged_mw.skills.settle import fallen
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task

@@ -23,7 +23,14 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.policies import Source, Trained, find_trained, load_policy
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
+from legged_mw.rl.transfer import (
+    TEACHER,
+    attach_teacher_observations,
+    begin_with,
+    check_start,
+    keep_teacher,
+    load_teacher,
+)
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -254,7 +261,7 @@ def test_an_exported_actor_has_a_normalizer_that_has_seen_much(student: Path) ->
 
 def seated(env: RobotTask, task: LoadedTask) -> torch.Tensor:
     """The observations that a policy of ``task`` is shown in ``env``, (N, size): a buffer of the step."""
-    seat_teacher(env, Trained(Source(Path("run"), Path("run/model_1.pt"), False), task))
+    attach_teacher_observations(env, Trained(Source(Path("run"), Path("run/model_1.pt"), False), task))
     return env.obs_buf[TEACHER]
 
 
@@ -416,7 +423,7 @@ def test_a_policy_that_would_mean_something_else_is_refused(change: Any, value: 
     change(task) if callable(change) else task.set(change, value)
     policy, groups = Trained(Source(Path("run"), Path("run/model_1.pt"), False), task), {*env.observations.groups}
     with pytest.raises(ConfigError, match="^run/model_1.pt "):
-        seat_teacher(env, policy)
+        attach_teacher_observations(env, policy)
     with pytest.raises(ConfigError, match="^run/model_1.pt "):
         check_start(env, load_task("go1_flat"), policy)
     assert {*env.observations.groups} == groups
@@ -447,7 +454,7 @@ def test_a_network_of_other_rows_is_refused(student: Path, teacher: Path) -> Non
     """A run's config may be changed by hand, or its task's class: the sizes tell."""
     env, found = make_env(2), find_trained(str(teacher), student.parent, "--teacher")
     found.task.set("terrain.height_scan", [])
-    seat_teacher(env, found)
+    attach_teacher_observations(env, found)
     task = load_task("go1_flat")
     runner = make_runner(env, task.train, None, "cpu", found.task.train)
     with pytest.raises(ConfigError, match="48 values"):

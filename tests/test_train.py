@@ -574,7 +574,7 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
     assert entropy == (0.005,) * 5
     assert growth == (0.0, 0.0, 0.5, 1.0, 1.0)
     assert sigma == pytest.approx([0.25, 0.2, 0.15, 0.1, 0.05]) == list(dict.fromkeys(rolled))
-    env.anneal(0.0)  # as a new environment has it
+    env.on_training_progress(0.0)  # as a new environment has it
     runner.current_learning_iteration, first = 3, len(rolled)
     runner.learn(2, False)
     assert rolled[first] == pytest.approx(0.1), "a resumed training goes on where it was, from its first step"

@@ -21,7 +21,7 @@ from PIL import Image
 from legged_mw import ROOT
 from legged_mw.deploy.contract import SCENE_FILE, TERRAIN_FILE
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.skills.settle import fallen
+from legged_mw.skills.drop_states import fallen
 from legged_mw.view.video import Frame
 
 IMAGES = ROOT / "docs/images"

@@ -94,7 +94,7 @@ def not_remembered(task: LoadedTask) -> str:
         lost = Lost(env)
         for _ in range(_STEPS):
             _step(env)
-        env.anneal(0.5)
+        env.on_training_progress(0.5)
         env.domain_rand.redraw()
         env.load_training_state(env.training_state())
         return lost.named()
@@ -212,7 +212,7 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
         _step(env, recordable(guard))
 
     def first() -> None:
-        env.anneal(0.0)
+        env.on_training_progress(0.0)
         _step(env)
 
     # on a GPU the first steps are not recorded: what is made once, may be made there; what __init__ made must stay
@@ -233,7 +233,7 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
                         place_of(env.observation_rows),
                     )
     # what a training calls between steps that are recorded by then
-    for call in (lambda: env.anneal(0.5), env.domain_rand.redraw, lambda: env.load_training_state(state)):
+    for call in (lambda: env.on_training_progress(0.5), env.domain_rand.redraw, lambda: env.load_training_state(state)):
         _check_kept(env, dict(_held(env)), call)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from legged_mw.drawing.relief import add_relief, add_squares
+from legged_mw.drawing.terrain_look import add_relief, add_squares
 from legged_mw.sim.ground import GROUND, Ground, add_ground
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
@@ -28,13 +28,13 @@ def visual_model(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjMo
 
 def visual_spec(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjSpec:
     """What ``visual_model`` is compiled from."""
-    spec = dressed(robot, camera)
+    spec = with_scene(robot, camera)
     if robot.terrain:
         add_relief(spec, robot.terrain, GROUND)
     return spec
 
 
-def dressed(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjSpec:
+def with_scene(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjSpec:
     """A copy of the robot's spec with a scene and a camera; its terrain is still the one height field.
 
     ``camera``: its place from the robot, world axes [m]; empty: by the robot's size.

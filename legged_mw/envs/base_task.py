@@ -94,7 +94,7 @@ class BaseTask(VecEnv):
 
     def fuse(self, steps: int) -> None:
         """Make the step faster where legged_mw/fast is there and that pays over so many ``steps``; else it stays as it is."""
-        if fusion := fast("fusion"):
+        if fusion := fast("step_compiler"):
             fusion.fuse(self, steps)
 
     def _step(self) -> None:

@@ -19,7 +19,7 @@ from legged_mw.envs.feet import FootContacts, GaitClock
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import NO_MIRROR, Block, command_block, foot_blocks, scan_block
 from legged_mw.envs.observations import Row
-from legged_mw.envs.robot_task import RobotTask, need, not_sensed
+from legged_mw.envs.robot_task import RobotTask, not_sensed, require
 from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.height_map import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners, opposites
@@ -56,9 +56,9 @@ class LeggedRobot(RobotTask):
         self._measure_ground()
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
         torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
-        self.told_to_move(out=self.moving)
+        self.is_commanded(out=self.moving)
 
-    def told_to_move(self, out: Tensor | None = None) -> Tensor:
+    def is_commanded(self, out: Tensor | None = None) -> Tensor:
         """(N,) The velocity command is more than to stand; written into ``out``, if there is one."""
         return torch.gt(self.velocity_command.square().sum(dim=1), self.cfg.rewards.min_command**2, out=out)
 
@@ -108,12 +108,12 @@ class LeggedRobot(RobotTask):
         self.foot_height.copy_(above[:, :-1])
         self.base_height.copy_(above[:, -1])
         speed = self.commands[:, :2].square().sum(dim=1, keepdim=True).sqrt()
-        self.asked_speed.copy_(torch.where(speed > self.cfg.rewards.min_command, speed, 0.0))
+        self.commanded_speed.copy_(torch.where(speed > self.cfg.rewards.min_command, speed, 0.0))
         along = (self.base_lin_vel[:, :2] * self.commands[:, :2]).sum(dim=1, keepdim=True) / speed.clamp(min=1e-6)
-        self.progress.addcmul_(along, (self.asked_speed > 0.0).float(), value=self.dt)
-        self.asked.add_(self.asked_speed, alpha=self.dt)
+        self.progress.addcmul_(along, (self.commanded_speed > 0.0).float(), value=self.dt)
+        self.commanded_distance.add_(self.commanded_speed, alpha=self.dt)
         away = (self.root_pos[:, :2] - self.tiles.origins[:, :2]).abs().amax(dim=1, keepdim=True)
-        torch.maximum(self.farthest, away, out=self.farthest)
+        torch.maximum(self.max_distance, away, out=self.max_distance)
 
     def _scan_heights(self) -> None:
         """The height scan: how far the ground lies below where it is when the robot stands on level ground, within 1 m."""
@@ -156,8 +156,8 @@ class LeggedRobot(RobotTask):
         """
         assert self.tiles
         left = (self.max_episode_length - self.episode_steps[:, 0]).clamp(min=0.0) * self.dt
-        asked = self.asked[:, 0] + torch.where(self.fell, self.asked_speed[:, 0] * left, 0.0)
-        up = self.farthest[:, 0] > self.tiles.size / 2
+        asked = self.commanded_distance[:, 0] + torch.where(self.fell, self.commanded_speed[:, 0] * left, 0.0)
+        up = self.max_distance[:, 0] > self.tiles.size / 2
         down = ~up & (self.progress[:, 0] < 0.5 * asked)
         self.tiles.promote(mask & (self.episode_steps[:, 0] > 0.0), up, down)
 
@@ -275,7 +275,7 @@ class LeggedRobot(RobotTask):
 
     def compute_observations(self) -> None:
         if self.gait:
-            self.gait.observe(self.told_to_move())
+            self.gait.observe(self.is_commanded())
         if self.cfg.terrain.height_scan:
             self._scan_heights()
         super().compute_observations()
@@ -401,15 +401,17 @@ class LeggedRobot(RobotTask):
 
     def _episode_columns(self) -> dict[str, int]:
         feet = len(self.foot_names)
-        ground = {"progress": 1, "asked": 1, "asked_speed": 1, "farthest": 1} if self.terrain else {}
+        ground = (
+            {"progress": 1, "commanded_distance": 1, "commanded_speed": 1, "max_distance": 1} if self.terrain else {}
+        )
         return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **ground}
 
     feet_air_time: Tensor  # (N, F) since the last contact [s]
     swing_peak: Tensor  # (N, F) highest foot position since the last contact [m]
     progress: Tensor  # (N, 1) along the commands [m]; only on terrain, as the three below
-    asked: Tensor  # (N, 1) what the commands asked [m]
-    asked_speed: Tensor  # (N, 1) what the last one asked [m/s]
-    farthest: Tensor  # (N, 1) from the middle of the tile, along x or y [m]
+    commanded_distance: Tensor  # (N, 1) what the commands asked [m]
+    commanded_speed: Tensor  # (N, 1) what the last one asked [m/s]
+    max_distance: Tensor  # (N, 1) from the middle of the tile, along x or y [m]
 
     def _init_terrain(self) -> None:
         """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""
@@ -450,12 +452,12 @@ class LeggedRobot(RobotTask):
 
     # ---- what reward terms need beside the state, where they are on ---------------------------------------------------
 
-    def anneal(self, done: float) -> None:
-        """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
-        super().anneal(done)
+    def on_training_progress(self, share: float) -> None:
+        """Follow a training, of which ``share`` (0 to 1) is done: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
+        super().on_training_progress(share)
         begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
         if isinstance(self.tracking_sigma, Tensor):
-            self.tracking_sigma.fill_(begin + (end - begin) * done)
+            self.tracking_sigma.fill_(begin + (end - begin) * share)
 
     def _init_foot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
@@ -555,7 +557,7 @@ class LeggedRobot(RobotTask):
 
         Feet that cross are nearer than 0. Of more than two feet it is the sum over mirrored pairs.
         """
-        need(self.num_feet > 1, "feet_distance", "asset.foot_names has one foot, which has no neighbour")
+        require(self.num_feet > 1, "feet_distance", "asset.foot_names has one foot, which has no neighbour")
         yaw, (left, right) = yaw_of(self.root_quat)[:, None], self.neighbours
         apart = self.foot_pos.index_select(1, left) - self.foot_pos.index_select(1, right)
         sideways = torch.cos(yaw) * apart[..., 1] - torch.sin(yaw) * apart[..., 0]
@@ -570,7 +572,7 @@ class LeggedRobot(RobotTask):
 
     def _reward_air_time_variance(self) -> Tensor:
         """How unlike the feet's last swings were, and their last stances: variances of their times, up to 0.5 s each [s^2]. [I, UL -1]"""
-        need(self.num_feet > 1, "air_time_variance", "asset.foot_names has one foot")
+        require(self.num_feet > 1, "air_time_variance", "asset.foot_names has one foot")
         swings, stances = (time.clamp(max=0.5).var(dim=1) for time in (self.last_air_time, self.last_contact_time))
         return swings + stances
 
@@ -617,12 +619,12 @@ class LeggedRobot(RobotTask):
         return self.foot_contact.sum(dim=1) == 1
 
     def _need_two_feet(self, term: str) -> None:
-        need(self.num_feet == 2, term, f"it is for robots with two feet; asset.foot_names has {self.num_feet}")
+        require(self.num_feet == 2, term, f"it is for robots with two feet; asset.foot_names has {self.num_feet}")
 
     # ---- the gait clock
 
     def _clock(self, term: str) -> GaitClock:
-        need(self.gait is not None, term, "there is no gait clock; set gait.period [s]")
+        require(self.gait is not None, term, "there is no gait clock; set gait.period [s]")
         assert self.gait
         return self.gait
 

@@ -12,18 +12,18 @@ from legged_mw.utils.bounds import (
     THREE,
     Bound,
     Count,
+    Duration,
     Height,
     NonNegative,
-    Part,
+    NonNegativeInt,
     Points,
     Positive,
+    PositiveShare,
     Range,
     Share,
     ShareRange,
     Sign,
-    Span,
     Swing,
-    Whole,
     or_empty,
 )
 from legged_mw.utils.commands import HEADING
@@ -54,16 +54,16 @@ class LeggedRobotCfg(RobotTaskCfg):
         contact_forces: bool = False
 
     class commands:
-        resampling_time: Span = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
+        resampling_time: Duration = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
         change_probability: Share = 0.5  # that a component changes at all when the timer ends [P]
         # of each command: that a changed one is not its default; beyond the list 1 [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]
 
         # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
         curriculum: bool = False
-        curriculum_start: Part = 0.4  # that share [-] [ours]
+        curriculum_start: PositiveShare = 0.4  # that share [-] [ours]
         # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
-        curriculum_step: Part = 0.1
+        curriculum_step: PositiveShare = 0.1
 
         heading_command: bool = False  # the yaw rate steers to a heading that is drawn in its place [L]
         heading_gain: Positive = 0.5  # yaw rate a heading error, within its range [1/s] [L]
@@ -83,7 +83,7 @@ class LeggedRobotCfg(RobotTaskCfg):
     class gait:
         """A clock (legged_mw/envs/feet.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
 
-        period: Span = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
+        period: Duration = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
         # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
         offsets: list[Share] = []
         stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
@@ -140,10 +140,10 @@ class LeggedRobotCfg(RobotTaskCfg):
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
             **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.1},
         }
-        seed: Whole = 1  # of all that is random in it
+        seed: NonNegativeInt = 1  # of all that is random in it
         curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
         # highest level at the start of training; the last one, if there are fewer [L]
-        max_init_terrain_level: Whole = 5
+        max_init_terrain_level: NonNegativeInt = 5
         measured_points_x: Points = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
         measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
         height_scan: list[Literal["state", "privileged_state"]] = []  # groups of observations that get the row

@@ -234,9 +234,9 @@ class RobotTask(BaseTask):
         if self.cfg.perturbation.curriculum:
             self.perturbation.update_level(mask, self._share_survived())
 
-    def anneal(self, done: float) -> None:
-        """A training is ``done`` so far, from 0 to 1: kicks, and what the terms change with it."""
-        self.perturbation.anneal(done)
+    def on_training_progress(self, share: float) -> None:
+        """Follow a training, of which ``share`` (0 to 1) is done: kicks, and what the terms change with it."""
+        self.perturbation.anneal(share)
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Root near its start with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
@@ -624,7 +624,7 @@ class RobotTask(BaseTask):
         if "joint_deviation" in on:
             self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])  # (D,)
         if "torque_limits" in on:
-            need(
+            require(
                 bool(np.isfinite(robot.effort_range).any()),
                 "torque_limits",
                 "no joint has a force limit; write asset.effort",
@@ -633,7 +633,7 @@ class RobotTask(BaseTask):
             self.soft_effort = self._row(robot.effort_range.T * rewards.soft_torque_limit)
         if "dof_vel_limits" in on:
             needed = "no joint has a highest speed; write asset.joint_speed_limits"
-            need(bool(np.isfinite(robot.speed_limits).any()), "dof_vel_limits", needed)
+            require(bool(np.isfinite(robot.speed_limits).any()), "dof_vel_limits", needed)
             self.soft_speed = self._row(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
 
     def _row(self, values: object) -> Tensor:
@@ -690,7 +690,7 @@ class RobotTask(BaseTask):
     def _reward_base_height(self) -> Tensor:
         """Squared distance of the root's height above the ground under it from ``rewards.base_height_target`` [m^2]. [L; U -10]"""
         target = self.cfg.rewards.base_height_target
-        need(
+        require(
             target > 0.0,
             "base_height",
             "rewards.base_height_target is 0; write the wanted height of the root above the ground [m]",
@@ -717,7 +717,7 @@ class RobotTask(BaseTask):
 
     def _reward_hip_pos(self) -> Tensor:
         """Squared distance of the joints that ``rewards.hip_joints`` means from the default pose [rad^2]. [U -1]"""
-        need(
+        require(
             bool(self.cfg.rewards.hip_joints),
             "hip_pos",
             "rewards.hip_joints is empty; write names of joints, parts of them or patterns",
@@ -731,7 +731,7 @@ class RobotTask(BaseTask):
     def _reward_joint_mirror(self) -> Tensor:
         """Squared difference of the angles of two legs' joints, mean over the pairs of ``rewards.mirror_joints`` [rad^2]. [UL]"""
         pairs = self.cfg.rewards.mirror_joints
-        need(
+        require(
             bool(pairs),
             "joint_mirror",
             "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]",
@@ -788,7 +788,7 @@ class RobotTask(BaseTask):
 
     def _reward_self_collision(self) -> Tensor:
         """How many contacts the robot has with itself. [M; its G1 -1]"""
-        need(
+        require(
             self.cfg.asset.self_collisions,
             "self_collision",
             "asset.self_collisions is False, so that parts pass through one another",
@@ -868,7 +868,7 @@ def check_term(method: Callable[[], Any], count: int) -> Tensor:
     return value
 
 
-def need(given: bool, term: str, what: str) -> None:
+def require(given: bool, term: str, what: str) -> None:
     """Refuse a term that is on without what it needs; terms are tried once before training."""
     if not given:
         raise ConfigError(f"rewards.scales.{term} is on, but {what}")

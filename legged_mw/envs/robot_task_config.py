@@ -17,25 +17,25 @@ from legged_mw.utils.bounds import (
     Count,
     Delays,
     Factors,
-    Few,
     Frictions,
     Gain,
     Height,
     Names,
     NonNegative,
+    NonNegativeInt,
     Offsets,
-    Part,
     Places,
     Positive,
     PositiveRange,
+    PositiveShare,
     Range,
     Scale,
     Seconds,
     Shares,
+    SmallInt,
     Speed,
+    StepDelays,
     Threads,
-    Whole,
-    WholeDelays,
     above,
     at_least,
     or_empty,
@@ -120,7 +120,7 @@ class RobotTaskCfg(Config):
         action_scale: Scale | dict[str, Scale] = 0.5
         # the default pose, the measured angles or the last targets [P]; "speed": none, a dc_motor gives damping (scale action - speed)
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
-        decimation: Few = 5  # simulation steps a control step [P]
+        decimation: SmallInt = 5  # simulation steps a control step [P]
 
     class observations:
         # group -> rows of the table that it does without: {"state": ["base_lin_vel"]}
@@ -139,7 +139,7 @@ class RobotTaskCfg(Config):
         clip_termination: bool = False
         max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
         # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
-        soft_dof_pos_limit: Part = 0.95
+        soft_dof_pos_limit: PositiveShare = 0.95
         pose_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `pose` [-]
         base_height_target: Height = 0.0  # of `base_height`: of the root above the ground under it [m]
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
@@ -184,7 +184,7 @@ class RobotTaskCfg(Config):
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
         # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
-        curriculum_rate: Part = 0.5
+        curriculum_rate: PositiveShare = 0.5
         # kicks grow from none to all between these shares of a training, [0.2, 0.5]; empty: all at once [ours]
         growth: Shares = []
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
@@ -209,9 +209,9 @@ class RobotTaskCfg(Config):
         encoder_offset: Offsets = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
         stall_torque: Factors = []  # factor on each motor's, of control.stall_torque
         no_load_speed: Factors = []  # factor on each motor's, of control.no_load_speed
-        action_delay: WholeDelays = []  # control steps from an action to its servo, whole numbers, both ends included
+        action_delay: StepDelays = []  # control steps from an action to its servo, whole numbers, both ends included
         delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
-        observation_delay: WholeDelays = []  # control steps that what `state` measures is old
+        observation_delay: StepDelays = []  # control steps that what `state` measures is old
         # [deg] of the plane, downhill along x, in place of terrain.slope: with any heading, any direction
         slope: Slopes = []
         # any other field of the model that may differ: a factor per world on all of it
@@ -230,7 +230,7 @@ class RobotTaskCfg(Config):
             *["encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
         ]
         # draw everything again every so many iterations of training, and when it is resumed; 0: never
-        redraw_iterations: Whole = 0
+        redraw_iterations: NonNegativeInt = 0
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
@@ -243,21 +243,22 @@ class RobotTaskCfg(Config):
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
         threads: Threads = 0  # of MuJoCo's own engine; 0: one a core
         dt: TimeStep = 0.004  # simulation step [s] [P]
-        iterations: Few = 1  # Newton iterations [P]
-        ls_iterations: Few = 5  # line-search iterations [P]
+        iterations: SmallInt = 1  # Newton iterations [P]
+        ls_iterations: SmallInt = 5  # line-search iterations [P]
         # implicitfast: joint damping is stable however large [P: euler]
         integrator: Literal["euler", "implicitfast"] = "euler"
         fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
-        nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model; see --check [ours: sim/capacity.py]
+        # contacts a world has room for (mujoco_warp); 0: counted from the model; see --check [ours: sim/capacity.py]
+        nconmax: NonNegativeInt = 0
         # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
-        njmax: Whole = 0
+        njmax: NonNegativeInt = 0
 
     class viewer:
         width: Pixels = 1280  # [pixel]
         height: Pixels = 720  # [pixel]
         # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         camera: Camera = []
-        fps: Few = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
+        fps: SmallInt = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
     def check(self) -> None:
         """Raise ConfigError at the first value that fits its field, but not the others. What a field alone may hold stands in its type."""

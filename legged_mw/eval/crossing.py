@@ -93,7 +93,7 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
         forget(policy, dones)
         fell |= dones & ~extras["time_outs"] & ~over
         over |= dones
-        crossed |= (env.farthest[:, 0] > edge) & ~over
+        crossed |= (env.max_distance[:, 0] > edge) & ~over
         over |= crossed
         env.commands.copy_(command)  # in a world that was reset too; it no longer counts
     return crossed, fell

@@ -9,7 +9,7 @@ import numpy as np
 
 from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
 from legged_mw.skills.clip import rotate
-from legged_mw.skills.settle import fallen
+from legged_mw.skills.drop_states import fallen
 
 SEED, SETTLING = 20_000, 1.5  # of the falls, [s] from the drop; training has seeds of its own: falls.seed
 # share of the standing height, [deg] from the vertical, [rad/s] mean joint speed: ours

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.drawing.relief import STEEP_LIGHT
-from legged_mw.drawing.scene import dressed
+from legged_mw.drawing.scene import with_scene
+from legged_mw.drawing.terrain_look import STEEP_LIGHT
 from legged_mw.rl.export_meshes import shorten
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
@@ -70,7 +70,7 @@ def standalone(
     ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be written out.
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
-    spec = dressed(robot, camera)
+    spec = with_scene(robot, camera)
     if files := [field.name for field in spec.hfields if field.file]:
         raise ModelError(
             f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers"

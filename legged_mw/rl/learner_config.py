@@ -10,17 +10,17 @@ from typing import Annotated, Any, Literal
 from legged_mw.utils.bounds import (
     Bound,
     Count,
-    Few,
     Iterations,
     NonNegative,
-    Part,
+    NonNegativeInt,
     Positive,
     PositiveRange,
+    PositiveShare,
     Seed,
     Share,
     Sizes,
+    SmallInt,
     Threads,
-    Whole,
 )
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.files import MOST_LETTERS, wrong_name
@@ -46,9 +46,9 @@ class RobotTaskCfgPPO(Config):
         num_steps_per_env: Count = 24  # control steps a world between two updates [P]
         max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
         save_interval: Count = 50  # [iterations] between checkpoints
-        keep_checkpoints: Whole = 0  # newest ones that stay; 0: all [ours]
+        keep_checkpoints: NonNegativeInt = 0  # newest ones that stay; 0: all [ours]
         # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
-        exam_interval: Whole = 200
+        exam_interval: NonNegativeInt = 200
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: FolderPart = ""  # appended to the run folder's time stamp
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
@@ -70,7 +70,7 @@ class RobotTaskCfgPPO(Config):
         # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
         rnn_type: Literal["gru", "lstm"] = "gru"
         rnn_hidden_dim: Count = 256  # values that a layer remembers [R]
-        rnn_num_layers: Few = 1  # [R]
+        rnn_num_layers: SmallInt = 1  # [R]
 
         class distribution_cfg:
             class_name: str = "GaussianDistribution"
@@ -85,18 +85,18 @@ class RobotTaskCfgPPO(Config):
             targets: list[str] = []
             hidden_dims: Sizes = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
             activation: Activation = "elu"
-            learning_rate: Part = 1e-3  # fixed [HIMLoco]
+            learning_rate: PositiveShare = 1e-3  # fixed [HIMLoco]
 
         class concurrent:
             """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (concurrent.py)."""
 
             # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
             groups: list[str] = []
-            teacher_share: Part = 0.75  # of the worlds, that act by the teacher's latent [CTS]
+            teacher_share: PositiveShare = 0.75  # of the worlds, that act by the teacher's latent [CTS]
             latent_dim: Count = 32  # values of a latent, whose length is 1 [go2_rl_gym]
             hidden_dims: Sizes = [512, 256]  # of both encoders [go2_rl_gym]
             activation: Activation = "elu"
-            learning_rate: Part = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
+            learning_rate: PositiveShare = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
 
     class critic:
         class_name: str = "MLPModel"
@@ -105,24 +105,26 @@ class RobotTaskCfgPPO(Config):
         obs_normalization: bool = True  # [P]
         rnn_type: Literal["gru", "lstm"] = "gru"  # as the actor's
         rnn_hidden_dim: Count = 256
-        rnn_num_layers: Few = 1
+        rnn_num_layers: SmallInt = 1
 
     class algorithm:
         class_name: str = "legged_mw.rl.ppo:GraphedPPO"  # or "PPO": rsl-rl's own, same results, slower on a GPU
-        num_learning_epochs: Few = 5  # [P]
+        num_learning_epochs: SmallInt = 5  # [P]
         num_mini_batches: Count = 4  # [P]
         clip_param: Positive = 0.2  # [P]
         gamma: Share = 0.99  # [P]
         lam: Share = 0.95  # [P]
         value_loss_coef: NonNegative = 1.0  # [P]
         entropy_coef: NonNegative = 0.005  # [ours; P 0.001]
-        learning_rate: Part = 1e-3  # at the start [R; P 3e-4]
+        learning_rate: PositiveShare = 1e-3  # at the start [R; P 3e-4]
         max_grad_norm: Positive = 1.0  # [P]
         optimizer: str = "adam"  # [P]
         use_clipped_value_loss: bool = True  # [P]
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
         desired_kl: Positive = 0.01  # between updates, for the adaptive schedule [R]
-        max_learning_rate: Part = 1e-2  # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
+        max_learning_rate: PositiveShare = (
+            1e-2  # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
+        )
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
     class distillation:
@@ -132,9 +134,9 @@ class RobotTaskCfgPPO(Config):
         teacher: str = ""
         init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
         class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
-        num_learning_epochs: Few = 5  # [R 1; ours: docs/lab.md]
+        num_learning_epochs: SmallInt = 5  # [R 1; ours: docs/lab.md]
         gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
-        learning_rate: Part = 1e-3  # [R]
+        learning_rate: PositiveShare = 1e-3  # [R]
         max_grad_norm: NonNegative = 1.0  # 0: no bound [R none; ours: as in PPO]
         loss_type: Literal["mse", "huber"] = "mse"  # [R]
         optimizer: str = "adam"  # [R]
@@ -159,7 +161,7 @@ class RobotTaskCfgPPO(Config):
         enable: bool = True
         envs_per_core: Count = 256  # worlds; the task's own number, if that is less
         num_steps_per_env: Count = 16
-        num_learning_epochs: Few = 5
+        num_learning_epochs: SmallInt = 5
         num_mini_batches: Count = 4
         desired_kl: Positive = 0.02
         hidden_dims: Sizes = [128, 64, 32]  # of actor and critic

@@ -15,8 +15,8 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import actor_settings, check_classes, network_section
+from legged_mw.rl.memory_check import check_room
 from legged_mw.rl.network import LEARNING_ONLY, read_parameters
-from legged_mw.rl.room import check_room
 from legged_mw.rl.runs import (
     CONFIG_FILE,
     check_fit,

@@ -156,7 +156,7 @@ class Runner(OnPolicyRunner):
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
-        self.env.anneal(done)
+        self.env.on_training_progress(done)
 
     def _must_stop(self) -> bool:
         """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""

@@ -23,14 +23,21 @@ from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
+from legged_mw.rl.memory_check import check_room
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
 from legged_mw.rl.recorded import Recorded
-from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
-from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
+from legged_mw.rl.transfer import (
+    TEACHER,
+    attach_teacher_observations,
+    begin_with,
+    check_start,
+    keep_teacher,
+    load_teacher,
+)
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_everything
@@ -190,7 +197,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check
     if start.policy:
         check_start(env, task, start.policy)
     if start.teacher:
-        seat_teacher(env, start.teacher)
+        attach_teacher_observations(env, start.teacher)
     for line in env.robot.overrides if this_rank().leads else ():
         if line.startswith("warning:"):
             print(line, flush=True)

@@ -53,7 +53,7 @@ def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any
     return settings
 
 
-def seat_teacher(env: RobotTask, teacher: Trained) -> None:
+def attach_teacher_observations(env: RobotTask, teacher: Trained) -> None:
     """Give ``env`` the observation group that the teacher reads. Raises ConfigError if its actions mean something else here."""
     env.observations.attach(_observe(env, teacher, "the teacher"), TEACHER, TEACHER)
     env.first_observations()

@@ -84,7 +84,7 @@ class WarpSimulation(Simulation):
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
-            shortcuts = fast("shortcuts")
+            shortcuts = fast("skip_kernels")
             self._shorter = shortcuts.ShortStep(model, self._model, self._data, world_fields) if shortcuts else None
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))

@@ -1,37 +1,57 @@
-"""Get up: from any fall to standing in the default pose, and staying there. The class, its config and its learner's.
+"""Get up from any fall, and stay standing in the default pose. Episodes begin in falls; a force lifts robots while they learn.
 
 Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobotLab), a G1; [ours] with the reason.
 """
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from torch import Tensor
 
 from legged_mw.envs.observations import Row
-from legged_mw.skills.falls import Falls, FallsCfg
-from legged_mw.skills.skill_config import SkillCfgPPO
-from legged_mw.utils.bounds import Seconds
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.simulation import Simulation
+from legged_mw.skills.drop_states import fallen
+from legged_mw.skills.skill_config import SkillCfg, SkillCfgPPO
+from legged_mw.utils.bounds import Count, NonNegativeInt, PositiveShare, Seconds, Share, above
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+from legged_mw.utils.math import assign
+
+Settling = Annotated[float, above(0, 60, "s")]
 
 # cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]
 UP_TILT, UP_HEIGHT = 0.966, 0.9
+# times: an episode that ends down raises the level by this much more than one that ends up lowers it [ours]
+GIVEN_BACK = 3.0
 
 
-class GetupCfg(FallsCfg):
-    class env(FallsCfg.env):
+class GetupCfg(SkillCfg):
+    class falls:
+        share: Share = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
+        states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
+        seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
+        seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has its own
+        pull: Share = 0.0  # share of the weight that lifts a robot; it fades as they learn [H 0.6]
+        pull_on: str = ""  # body that it lifts; empty: the root, from which a robot whose trunk is heavier than its legs hangs head down
+        pull_fades: PositiveShare = 0.2  # of it, when every world has ended an episode up [ours]
+
+    class env(SkillCfg.env):
         episode_length_s = 6.0  # [s] [P]
 
-    class asset(FallsCfg.asset):
+    class asset(SkillCfg.asset):
         self_collisions = True  # and all colliders touch the ground [P]
 
-    class control(FallsCfg.control):
+    class control(SkillCfg.control):
         # [P, H: about the default pose noise turns no robot over; docs/skills.md], [rad] [P]
         action_origin, action_scale = "joints", 0.5
 
-    class termination(FallsCfg.termination):
+    class termination(SkillCfg.termination):
         max_tilt = 180.0  # [deg]: no attitude ends an episode [P, H]
 
-    class domain_rand(FallsCfg.domain_rand):
+    class domain_rand(SkillCfg.domain_rand):
         # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
         base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.25, 1.2]
         stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
@@ -40,11 +60,11 @@ class GetupCfg(FallsCfg):
     class exam:
         within: Seconds = 3.0  # [s] in which it must stand
 
-    class rewards(FallsCfg.rewards):
+    class rewards(SkillCfg.rewards):
         # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
         only_positive_rewards = False
 
-        class scales(FallsCfg.rewards.scales):  # [P], with our terms of the same meaning
+        class scales(SkillCfg.rewards.scales):  # [P], with our terms of the same meaning
             upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
             action_rate, action_smoothness, torques, dof_acc, dof_pos_limits = -0.005, -0.001, -1e-5, -1e-8, -0.1
             # [ours, P -0.1 and dof_acc -2.5e-7: at first the noise would cost ten times what it gains]
@@ -61,14 +81,92 @@ class GetupCfgPPO(SkillCfgPPO):
         gamma = 0.98  # [P 0.97]
 
 
-class Getup(Falls):
+class LiftAssist:
+    """A force against gravity on a body of each robot: ``level`` (), from 1 to 0, times ``force`` [N].
+
+    One that is up keeps it: else robots learn to lean in it rather than to stand without, and it never fades.
+    """
+
+    written = ("level",)
+
+    def __init__(self, sim: Simulation, body: int, gravity_dir: Tensor, force: float, fades: float) -> None:
+        """``gravity_dir``: (N, 3) in the world, which leans where a slope was drawn. ``fades``: by how much the level falls when
+        every world has ended an episode up."""
+        self._force, self._down, self._fades = sim.xfrc_applied[:, body, :3], gravity_dir, fades  # a view (N, 3)
+        self._highest, self.level = force, torch.ones((), device=sim.device)
+
+    def apply(self) -> None:
+        """Before a step."""
+        if self._highest:
+            torch.mul(self._down, -self._highest * self.level, out=self._force)
+
+    def update(self, ended: Tensor, up: Tensor) -> None:
+        """Episodes have ended, (N,) each."""
+        if self._highest:
+            change = torch.where(up, -1.0, GIVEN_BACK).masked_fill(~ended, 0.0).mean()
+            self.level.add_(change, alpha=self._fades).clamp_(0.0, 1.0)
+
+    def statistics(self) -> dict[str, Tensor]:
+        """The level, a sum and what to divide it by."""
+        return {"pull": torch.stack([self.level, torch.ones_like(self.level)])} if self._highest else {}
+
+
+class Getup(RobotTask):
     cfg: GetupCfg
     exam = "getup"
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
+        falls = self.cfg.falls
+        states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
+        self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
         self.upright = self.buffer()  # (N,) cosine of the tilt
+        self.up = self.buffer(dtype=torch.bool)  # (N,) as high and upright as one that stands
+        self.pull = self.remember(
+            LiftAssist(
+                self.sim, self._lifted(), self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades
+            )
+        )
+
+    def _lifted(self) -> int:
+        """The body that ``falls.pull`` lifts."""
+        falls, model = self.cfg.falls, self.robot.physics
+        names = [model.body(i).name for i in range(1, model.nbody)]
+        if falls.pull_on and falls.pull_on not in names:
+            raise ConfigError(f"falls.pull_on: {unknown('body', falls.pull_on, names, self.cfg.asset.file)}")
+        lifted = model.body(falls.pull_on).id if falls.pull_on else self.root_body
+        if falls.pull and lifted == self.root_body and self.cfg.perturbation.kick:
+            raise ConfigError(
+                "falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on"
+            )
+        return lifted
+
+    def _reset_robots(self, mask: Tensor) -> None:
+        """Standing as any task begins, or, by chance, in one of the settled falls."""
+        super()._reset_robots(mask)
+        fall = mask & (torch.rand_like(self.rew_buf) < self.cfg.falls.share)
+        pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)
+        assign(self.sim.qpos, fall, self.fallen_qpos.index_select(0, pick))
+        assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
+
+    def _apply_actions(self) -> None:
+        super()._apply_actions()
+        self.pull.apply()
+
+    def _update_curricula(self, mask: Tensor) -> None:
+        super()._update_curricula(mask)
+        self.pull.update(mask & (self.episode_steps[:, 0] > 0.0), self.up)
+
+    def _live_statistics(self) -> dict[str, Tensor]:
+        return super()._live_statistics() | self.pull.statistics()
+
+    def training_state(self) -> dict[str, Tensor]:
+        return super().training_state() | {"pull_level": self.pull.level.clone()}
+
+    def load_training_state(self, state: dict[str, Tensor]) -> None:
+        super().load_training_state(state)
+        self.pull.level.copy_(state.get("pull_level", self.pull.level))
 
     def _refresh_base(self) -> None:
         super()._refresh_base()

@@ -6,7 +6,7 @@ Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] 
 from __future__ import annotations
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.utils.bounds import FileNames, NonNegative, NonNegativeVector, Part, Positive, Seconds, Span
+from legged_mw.utils.bounds import Duration, FileNames, NonNegative, NonNegativeVector, Positive, PositiveShare, Seconds
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -33,10 +33,11 @@ class MotionTrackingCfg(RobotTaskCfg):
         # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
         random_start: bool = True
         # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
-        hold_s: Span = 1.0
+        hold_s: Duration = 1.0
         bin_s: Seconds = 1.0  # length of a bin [s]
-        failure_rate: Part = 0.001  # share of a step in the moving average of the failures in each bin
-        uniform: Part = 0.1  # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]
+        failure_rate: PositiveShare = 0.001  # share of a step in the moving average of the failures in each bin
+        # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]
+        uniform: PositiveShare = 0.1
         # off the reference as an episode begins, each U(-range, range): x, y, z [m]
         start_pos: NonNegativeVector = [0.05, 0.05, 0.01]
         start_turn: NonNegativeVector = [0.1, 0.1, 0.2]  # about x, y, z [rad]

@@ -59,9 +59,9 @@ Positive = Annotated[float, above(0)]
 NonNegative = Annotated[float, at_least(0)]
 Scale = Annotated[float, Bound("another number than 0, and 10,000 at most", lambda value: 0 < abs(value) <= 1e4)]
 Share = Annotated[float, at_least(0, 1)]
-Part = Annotated[float, above(0, 1)]  # a share that is not 0
+PositiveShare = Annotated[float, above(0, 1)]  # a share that is not 0
 Seconds = Annotated[float, above(0, 1e6, "s")]  # a million: what counts steps never overflows
-Span = Annotated[float, at_least(0, 1e6, "s")]  # such a time, or none
+Duration = Annotated[float, at_least(0, 1e6, "s")]  # such a time, or none
 Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s]: no machine is as fast
 Height = Annotated[float, at_least(0, 10, "m")]  # of a robot or of its feet
 Swing = Annotated[float, above(0, 10, "m")]  # such a height, that is not 0
@@ -70,8 +70,8 @@ Gain = Annotated[float, at_least(0, 1e6)]  # in SI units, of a joint or motor: n
 Sign = Annotated[float, Bound("1 or -1", lambda value: value in (1, -1))]
 
 Count = Annotated[int, at_least(1)]
-Whole = Annotated[int, at_least(0)]
-Few = Annotated[int, at_least(1, 1000)]  # of what is repeated in a loop, where more would never end
+NonNegativeInt = Annotated[int, at_least(0)]
+SmallInt = Annotated[int, at_least(1, 1000)]  # of what is repeated in a loop, where more would never end
 Iterations = Annotated[int, at_least(0, 1_000_000)]
 Threads = Annotated[int, at_least(0, 1024)]
 Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
@@ -100,7 +100,7 @@ ContactTimes = Annotated[list[Annotated[float, at_least(1e-4, 10, "s")]], or_emp
 Offsets = Annotated[list[float], or_empty(PAIR)]
 Shares = Annotated[list[Share], or_empty(PAIR)]
 Delays = Annotated[list[NonNegative], or_empty(PAIR)]
-WholeDelays = Annotated[list[Whole], or_empty(PAIR)]
+StepDelays = Annotated[list[NonNegativeInt], or_empty(PAIR)]
 
 
 def bare(kind: Any) -> Any:

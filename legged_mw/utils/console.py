@@ -12,7 +12,7 @@ from typing import Any, TextIO
 _GONE = (errno.EPIPE, errno.EIO, errno.EBADF)  # a closed pipe, a terminal that hung up, a closed descriptor
 
 
-class Patient:
+class SafeStream:
     """A stream that loses what cannot be written."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -49,7 +49,7 @@ class Patient:
 @contextmanager
 def patient_console() -> Iterator[None]:
     """What is printed inside may be lost, and ends nothing."""
-    out, err = Patient(sys.stdout), Patient(sys.stderr)
+    out, err = SafeStream(sys.stdout), SafeStream(sys.stderr)
     with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
         try:
             yield

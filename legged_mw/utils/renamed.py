@@ -32,6 +32,7 @@ LEGGED_GYM_METHODS: dict[str, str] = {
     "_post_physics_step_callback": "_update_state() and _end_step()",
     "_get_noise_scale_vec": "observation_rows()",
     "reset_idx": "reset_envs(mask)",
+    "anneal": "on_training_progress(share)",  # not legged_gym's: ours, before
     "_reset_dofs": "_reset_robots(mask)",
     "_reset_root_states": "_reset_robots(mask)",
     "update_command_curriculum": "_update_command_curriculum(mask)",

@@ -63,7 +63,7 @@ class EnvStage:
             for group, columns, scales in self._command_columns:
                 env.obs_buf[group][:, columns] = self._commands * scales
             if self._gait and isinstance(env, LeggedRobot):
-                self._gait.observe(env.told_to_move())
+                self._gait.observe(env.is_commanded())
                 for group, columns, scales in self._clock_columns:
                     env.obs_buf[group][:, columns] = self._gait.row * scales
             self._obs = env.get_observations()

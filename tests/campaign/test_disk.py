@@ -27,7 +27,7 @@ from legged_mw.rl.ranks import Rank
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.console import Patient
+from legged_mw.utils.console import SafeStream
 
 RUN = ["--seed", "1", "--eager", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
 GO_ON = ["--task", "go1_flat", "--device", "cpu", "--resume"]
@@ -184,7 +184,7 @@ def test_a_line_that_does_not_fit_is_lost_and_the_next_one_is_not() -> None:
 
     stream = Full()
     for text in ("one\n", "full\n", "two\n"):
-        print(text, end="", file=Patient(stream), flush=True)  # type: ignore[arg-type]
+        print(text, end="", file=SafeStream(stream), flush=True)  # type: ignore[arg-type]
     assert stream.text == "one\ntwo\n"
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.fast.fused import Fused, Kernel, Region
-from legged_mw.fast.fusion import fused as fuse
-from legged_mw.fast.fusion import fused_step, remember
+from legged_mw.fast.step_compiler import fused as fuse
+from legged_mw.fast.step_compiler import fused_step, remember
 from legged_mw.fast.trace import Trace
 from legged_mw.utils.opaque import not_traced, tracing
 from legged_mw.utils.task import load_task

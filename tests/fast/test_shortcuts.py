@@ -12,7 +12,8 @@ import warp as wp
 from torch import Tensor
 from worlds import make_env
 
-from legged_mw.fast import contact_count, shortcuts
+from legged_mw.fast import contact_count
+from legged_mw.fast import skip_kernels as shortcuts
 from legged_mw.sim.warp_engine import WarpSimulation
 
 WORLDS = 6

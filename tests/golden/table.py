@@ -197,7 +197,7 @@ BEYOND = {  # raises that no case can come to, or none that is cheap: file -> wh
     "envs/base_task.py": "a mistake of a program's, not of a user's",
     "eval/rollout.py": "a mistake of a program's, not of a user's",
     "rl/training.py": "ends a training that has begun: tests/campaign/test_disk.py, tests/test_ranks.py",
-    "fast/fusion.py": "is caught, and the step is recorded without",
+    "fast/step_compiler.py": "is caught, and the step is recorded without",
     "sim/graph.py": "needs a GPU",
     "sim/warp_engine.py": "as of the other engine",
     "tools/completion.py": "a mistake of a program's, not of a user's",

@@ -153,7 +153,7 @@ def table() -> Table:
     for name, (change, value) in CHANGES.items():
         made.add(
             f"teacher of another {name}",
-            lambda root, change=change, value=value: other(change, value, test_teacher.seat_teacher),
+            lambda root, change=change, value=value: other(change, value, test_teacher.attach_teacher_observations),
         )
     made.add("beginning of another pose", lambda root: other(*CHANGES["pose"], begins))
     made.add("beginning of another history", lambda root: other("observations.history", {"state.dof_pos": 2}, begins))

@@ -17,8 +17,8 @@ from program import run
 
 from benchmarks import terrain_picture
 from legged_mw import ROOT
-from legged_mw.drawing.relief import relief
 from legged_mw.drawing.scene import ground_model, visual_model, visual_spec
+from legged_mw.drawing.terrain_look import relief
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.task import load_task
