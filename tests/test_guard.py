@@ -468,7 +468,7 @@ ORDINARY = {
     "made in the first step": (END_STEP, "self.half = getattr(self, 'half', None) or [torch.tensor(0.5)]"),
     "a number that stays": (END_STEP, "self.unknown = float('nan')"),
     "on the device": (END_STEP, "self.past.add_(self.moved + self.net(self.past[:, None])[:, 0])"),
-    "in place by a training": (ANNEAL, "self.past.fill_(done); self.slots.one.copy_(self.past)"),
+    "in place by a training": (ANNEAL, "self.past.fill_(share); self.slots.one.copy_(self.past)"),
     "random numbers between steps": (ANNEAL, "self.past.fill_(random.random() + RNG.normal())"),
     "a number without a device": (INIT, "self.own = torch.tensor(0.5)"),
     "a file's, moved by a call": (INIT, "self.own = torch.as_tensor(AT_IMPORT, device=self.device)"),
