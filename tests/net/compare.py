@@ -150,7 +150,11 @@ def _training(root: Path, flags: Sequence[str]) -> dict[str, np.ndarray]:
     with _trained(root, [*flags, *NO_EXPORT]) as run:
         [*_, last] = sorted(run.glob("model_*.pt"), key=lambda path: int(path.stem.partition("_")[2]))
         leaves = dict(_leaves(torch.load(last, weights_only=True)))
-        found = {f"config.yaml/{name}": value for name, value in _text(run / "config.yaml").items()}
+        leaves = {
+            name: value.replace(str(root), "ROOT") if isinstance(value, str) else value
+            for name, value in leaves.items()
+        }
+        found = {f"config.yaml/{name}": value for name, value in _text(run / "config.yaml", root).items()}
     for name, value in leaves.items():
         if isinstance(value, torch.Tensor):
             shape = f"{str(value.dtype).removeprefix('torch.')}{[*value.shape]}"
@@ -192,9 +196,11 @@ def _files(folder: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _text(file: Path) -> dict[str, np.ndarray]:
-    """Lines, and all bytes in short: lines hide how they end."""
+def _text(file: Path, root: Path | None = None) -> dict[str, np.ndarray]:
+    """Lines, and all bytes in short: lines hide how they end. Paths in the checkout ``root`` are compared from there on."""
     data = file.read_bytes()
+    if root is not None:
+        data = data.replace(str(root).encode(), b"ROOT")
     return {"lines": np.array(data.decode().splitlines()), "bytes": np.array(hashlib.sha256(data).hexdigest()[:16])}
 
 

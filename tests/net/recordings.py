@@ -256,7 +256,7 @@ def rollout(
     env.episode_length_buf = torch.randint(0, int(env.max_episode_length), (worlds,), generator=own)
     for step in range(steps):
         if step == steps // 2:
-            env.on_training_progress(0.3)
+            (env.on_training_progress if hasattr(env, "on_training_progress") else env.anneal)(0.3)  # its name before
         obs, reward, done, extras = env.step(torch.randn(worlds, env.num_actions, generator=own))
         observed.append(obs)
         stepped.append((reward, done, extras["time_outs"], env.episode_length_buf.clone()))
