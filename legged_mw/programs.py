@@ -12,12 +12,17 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 from legged_mw.utils.cli import FEWER_WORLDS, fail, one_line_errors
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.machine import settle
 from legged_mw.utils.opaque import fast
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
+
+if TYPE_CHECKING:
+    from legged_mw.eval.grading import Graded
 
 
 def start_quickly(gpu: str | None = "cpu") -> None:
@@ -99,7 +104,8 @@ def play() -> None:
     settle()
     if args.eval:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
-        grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
+        policies = [(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)]
+        grading.grade(policies, args, grade_export)
         return
     if args.export:
         check_classes(trained.train)
@@ -107,6 +113,24 @@ def play() -> None:
         print(export(trained, source.checkpoint, Path(args.export), args.half))
         return
     playing.watch(source, *playing.prepare(source, trained, args), args)
+
+
+def grade_export(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
+    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
+    from legged_mw.deploy.exam import run
+    from legged_mw.envs.domain_rand import active
+
+    task = graded.task
+    if active(task.cfg):
+        print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")
+        return []
+    with TemporaryDirectory() as folder:
+        try:
+            export(task, graded.source.checkpoint, Path(folder) / "export")
+            return [("the same, deployed in MuJoCo", run(Path(folder) / "export", graded.exam.rules(task)))]
+        except UserError as error:  # a row that nobody can measure, no onnxruntime
+            print(f"not graded through an export: {error}")
+            return []
 
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:

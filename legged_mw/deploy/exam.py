@@ -26,6 +26,11 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
 
+def run(folder: Path, exam: ExamRules | Skill) -> dict[str, Any]:
+    """Grade the export in ``folder`` by the rules ``exam``."""
+    return run_skill(folder, exam) if isinstance(exam, Skill) else run_exam(folder, exam)
+
+
 def run_exam(
     folder: Path,
     exam: ExamRules | None = None,

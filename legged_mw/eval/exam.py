@@ -7,7 +7,6 @@ overrides and a roll-out, not a second environment: all tests run side by side a
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -74,13 +73,6 @@ def run_exam(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
     """Grade ``policy`` in an environment made from a prepared task."""
     rules = ExamRules.from_config(env.cfg)
     return grade(rules, roll_out(env, policy, cases(rules, env.dt), round(SECONDS / env.dt), SIGNALS))
-
-
-def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
-    """Grade the export in ``folder`` of a prepared task, as ``legged_mw.deploy`` does."""
-    from legged_mw.deploy.exam import run_exam  # MuJoCo alone, which training needs nothing of
-
-    return run_exam(folder, ExamRules.from_config(task.cfg))
 
 
 def grade(rules: ExamRules, record: Record) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval import crossing, exam, perform, report, rules
 from legged_mw.eval.rollout import Policy
+from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.skill import Skill
 from legged_mw.eval.skills import SKILLS
 from legged_mw.eval.training import TrainingExam
 from legged_mw.utils.config import ConfigError
@@ -35,8 +36,7 @@ class Exam(NamedTuple):
     ask_alike: Callable[[Sequence[LoadedTask]], None]  # grade prepared tasks by the rules of the first
     # (env, policy, env of the rough part or None) -> result, figures
     examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]
-    # the result of an export in that folder, in MuJoCo's C engine
-    deployed: Callable[[Path, LoadedTask], dict[str, Any]]
+    rules: Callable[[LoadedTask], ExamRules | Skill]  # what a prepared task is graded by, also on another physics
     table: Callable[[dict[str, Any]], str]  # the result as text
     write: Callable[..., None]  # the report: see report.write
     in_training: Callable[[LoadedTask, str, bool], Examiner]  # task, device, eager
@@ -51,7 +51,7 @@ def _skill(kind: str) -> Exam:
         make_room=perform.make_room,
         ask_alike=perform.ask_alike,
         examine=partial(perform.examine, kind),
-        deployed=perform.deployed,
+        rules=lambda task: perform.skill_of(task.cfg, task.exam),
         table=perform.table,
         write=perform.write,
         in_training=perform.InTraining,
@@ -65,7 +65,7 @@ EXAMS = {
         make_room=report.make_room,
         ask_alike=report.ask_alike,
         examine=report.examine,
-        deployed=exam.deployed,
+        rules=lambda task: ExamRules.from_config(task.cfg),
         table=rules.table,
         write=report.write,
         in_training=TrainingExam,

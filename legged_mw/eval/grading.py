@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import copy
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from legged_mw.envs.domain_rand import active
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
@@ -19,7 +17,7 @@ from legged_mw.rl.policies import Source, introduce, load_policy
 from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.errors import shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.task import LoadedTask
 
@@ -34,8 +32,14 @@ class Graded(NamedTuple):
     crossing: LoadedTask | None  # for the exam's rough part, if there is one
 
 
-def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -> None:
-    """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first."""
+Elsewhere = Callable[[Graded], list[tuple[str, dict[str, Any]]]]  # results by name
+
+
+def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
+    """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first.
+
+    ``elsewhere`` grades the first policy once more, on another physics.
+    """
     device = pick_device(args.device)
     first, *rivals = policies
     graded = [prepare(*first, args, common=args.ranges == "common"), *(prepare(*rival, args) for rival in rivals)]
@@ -116,19 +120,3 @@ def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask
         else {}
     )
     return Column(name, about, result, figures)
-
-
-def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
-    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
-    from legged_mw.rl.export import export  # onnx takes a while to import
-
-    if active(graded.task.cfg):
-        print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")
-        return []
-    with TemporaryDirectory() as folder:
-        try:
-            export(graded.task, graded.source.checkpoint, Path(folder) / "export")
-            return [("the same, deployed in MuJoCo", graded.exam.deployed(Path(folder) / "export", graded.task))]
-        except UserError as error:  # a row that nobody can measure, no onnxruntime
-            print(f"not graded through an export: {error}")
-            return []

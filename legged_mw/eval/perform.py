@@ -146,13 +146,6 @@ def perform(
     return Recording(**arrays, ended_at=ended_at.cpu().numpy())
 
 
-def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
-    """Grade the export in ``folder`` of a prepared task, as ``legged_mw.deploy`` does."""
-    from legged_mw.deploy.exam import run_skill  # MuJoCo alone, which training needs nothing of
-
-    return run_skill(folder, skill_of(task.cfg, task.exam))
-
-
 class InTraining:
     """The first part of the exam for a policy that trains; see ``training.TrainingExam``, which is the walking exam's."""
 
