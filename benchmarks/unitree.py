@@ -22,13 +22,13 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
-from legged_mw.deploy.unitree.faults import Faults, parse_faults
-from legged_mw.deploy.unitree.link import RobotEnd, Wire
-from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules
+from legged_mw.unitree.client import Direct, UnitreeRobot
+from legged_mw.unitree.faults import Faults, parse_faults
+from legged_mw.unitree.link import RobotEnd, Wire
+from legged_mw.unitree.robots import machine_of
+from legged_mw.unitree.serve import STEP, SimulatedUnitree
 
 
 def begin(sim: SimulatedUnitree, robot: UnitreeRobot) -> None:

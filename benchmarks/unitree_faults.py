@@ -33,12 +33,12 @@ from pytest import MonkeyPatch
 from legged_mw.deploy import states
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.loop import real_time
-from legged_mw.deploy.unitree import clock
-from legged_mw.deploy.unitree.client import connect
-from legged_mw.deploy.unitree.link import RobotEnd, Wire
-from legged_mw.deploy.unitree.program import PRIORITY
-from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import DAMPED, STEP, SimulatedUnitree
+from legged_mw.unitree import clock
+from legged_mw.unitree.client import connect
+from legged_mw.unitree.link import RobotEnd, Wire
+from legged_mw.unitree.program import PRIORITY
+from legged_mw.unitree.robots import machine_of
+from legged_mw.unitree.serve import DAMPED, STEP, SimulatedUnitree
 from tests.faults import CASES, Case, Rig, Side, lockstep
 from tests.wires import POLICIES, locked_domain
 

@@ -166,7 +166,15 @@ def _tool(name: str) -> Callable[[], None]:
     return start
 
 
-PROGRAMS = {
+def completion() -> None:
+    """The Tab key for bash and zsh."""
+    from legged_mw.tools.completion import main
+
+    with one_line_errors():
+        main(PROGRAMS)
+
+
+PROGRAMS: dict[str, Callable[[], None]] = {
     "train": train,
     "play": play,
     "deploy": deploy,
@@ -176,7 +184,7 @@ PROGRAMS = {
     "compare": _tool("legged_mw.tools.compare"),
     "sweep": _tool("legged_mw.tools.sweep"),
     "warm": _tool("legged_mw.tools.warm"),
-    "completion": _tool("legged_mw.tools.completion"),
+    "completion": completion,
 }
 HELP = """legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help
   train       train a task: legged-mw train --task go1_flat

@@ -23,13 +23,13 @@ from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import States
-from legged_mw.deploy.unitree.client import UnitreeRobot
-from legged_mw.deploy.unitree.codec import Message
-from legged_mw.deploy.unitree.faults import Faults, parse_faults
-from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
-from legged_mw.deploy.unitree.link import RobotEnd, Wire
-from legged_mw.deploy.unitree.remote import encode
-from legged_mw.deploy.unitree.serve import STEP, Record, SimulatedUnitree
+from legged_mw.unitree.client import UnitreeRobot
+from legged_mw.unitree.codec import Message
+from legged_mw.unitree.faults import Faults, parse_faults
+from legged_mw.unitree.guard import Board, Guard, Guarded
+from legged_mw.unitree.link import RobotEnd, Wire
+from legged_mw.unitree.remote import encode
+from legged_mw.unitree.serve import STEP, Record, SimulatedUnitree
 
 ALONE = 0.22  # [s] of 12 measurements, in which a part that is frozen alone can be known
 SOON = 0.1  # [s] within which joints must be damped

@@ -38,6 +38,7 @@ TOOLS = (
     "legged_mw.motion",
     "legged_mw.skills",
     "legged_mw.tools",
+    "legged_mw.unitree",
 )
 ONLY_IN = {
     "warp": ["legged_mw/sim/*", "legged_mw/fast/*"],
@@ -77,16 +78,17 @@ ONLY_IN = {
         "legged_mw/motion/look.py",
     ],
     "legged_mw.motion": ["legged_mw/motion/*"],
+    "legged_mw.unitree": ["legged_mw/unitree/*"],  # deploy finds it by name
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.tools": ["legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.deploy": [
-        *("legged_mw/deploy/*", "legged_mw/rl/export*.py", "legged_mw/eval/*", "legged_mw/programs.py"),
+        *("legged_mw/deploy/*", "legged_mw/unitree/*", "legged_mw/rl/export*.py", "legged_mw/programs.py"),
         "examples/udp_robot.py",
     ],
     "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
-    "legged_mw.programs": ["train.py", "play.py", "legged_mw/tools/completion.py"],
+    "legged_mw.programs": ["train.py", "play.py"],
     "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/network.py"],
-    "cyclonedds": ["legged_mw/deploy/unitree/idl.py", "legged_mw/deploy/unitree/link.py"],
+    "cyclonedds": ["legged_mw/unitree/idl.py", "legged_mw/unitree/link.py"],
     "configs": ["configs/*", "examples/*"],
     "train": [],
     "play": [],
@@ -133,6 +135,7 @@ DEPLOY_MAY = [
         "matplotlib",
         "legged_mw.ROOT",
         "legged_mw.deploy",
+        "legged_mw.unitree",
         "legged_mw.view",
         "legged_mw.eval.rules",
         "legged_mw.eval.skill",
@@ -205,7 +208,7 @@ def violations(path: str, source: str) -> list[str]:
             never = False
         if path.startswith("configs/"):
             never = not any(within(name, package) for package in CONFIGS_MAY)
-        if path.startswith("legged_mw/deploy/"):
+        if path.startswith(("legged_mw/deploy/", "legged_mw/unitree/")):
             never = not any(within(name, package) for package in DEPLOY_MAY)
         hook = any(within(name, package) for package in HOOKS.get(path, ()))
         if not hook and (outside or never or against_the_layers(path, name)):
@@ -215,7 +218,11 @@ def violations(path: str, source: str) -> list[str]:
 
 def circles(sources: Mapping[str, str]) -> list[tuple[str, ...]]:
     """Modules (dotted name -> source) that import each other, directly or not: each group once."""
-    graph = {name: _imported(source, sources) - {name} for name, source in sources.items()}
+    return rounds({name: _imported(source, sources) - {name} for name, source in sources.items()})
+
+
+def rounds(graph: Mapping[str, set[str]]) -> list[tuple[str, ...]]:
+    """Nodes of a graph that reach each other: each group once."""
     reach = {name: _reached(graph, name) for name in graph}
     return sorted(
         {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in graph if name in reach[name]}
@@ -332,8 +339,8 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/deploy/runner.py", "from legged_mw.eval import rules", False),
         ("legged_mw/deploy/runner.py", "from legged_mw.sim.model import unknown", True),
         ("legged_mw/deploy/runner.py", "import cyclonedds", True),
-        ("legged_mw/deploy/unitree/client.py", "def f():\n    from cyclonedds.domain import Domain", True),
-        ("legged_mw/deploy/unitree/link.py", "from cyclonedds.domain import Domain", False),
+        ("legged_mw/unitree/client.py", "def f():\n    from cyclonedds.domain import Domain", True),
+        ("legged_mw/unitree/link.py", "from cyclonedds.domain import Domain", False),
         ("legged_mw/deploy/runner.py", "import socket\nimport numpy as np\nimport mujoco", False),
         ("legged_mw/rl/export.py", "from legged_mw.deploy.contract import Contract", False),
         ("legged_mw/rl/runner.py", "from legged_mw.deploy.contract import Contract", True),
@@ -394,6 +401,32 @@ def test_circles_are_found(back: str) -> None:
     assert circles(straight) == []
     assert circles({**straight, "a.three": back}) == [("a.one", "a.three", "a.two")]
     assert circles({**straight, "a.two": back}) == [("a.one", "a.two")]
+
+
+def package_of(name: str) -> str:
+    """The package of legged_mw that a module belongs to; "" for those beside the packages. What exports is one of its own."""
+    parts = name.split(".")
+    if parts[0] != "legged_mw" or len(parts) < 3 or not (ROOT / "legged_mw" / parts[1]).is_dir():
+        return ""
+    return "export" if name.startswith("legged_mw.rl.export") else parts[1]
+
+
+def package_graph(sources: Mapping[str, str]) -> dict[str, set[str]]:
+    """Package -> packages that it imports; paths -> sources. The core's one door to a package around it is left out."""
+    graph: dict[str, set[str]] = {}
+    for path, source in sources.items():
+        here = package_of(path.removesuffix(".py").replace("/", "."))
+        names = [name for name in imports(source) if not any(within(name, hook) for hook in HOOKS.get(path, ()))]
+        graph.setdefault(here, set()).update({package_of(f"{name}.") for name in names} - {here, ""})
+    return {here: {other for other in found if other in graph} for here, found in graph.items() if here}
+
+
+def test_no_two_packages_import_each_other() -> None:
+    """Neither directly nor round about."""
+    sources = {path: (ROOT / path).read_text() for path in FILES if path.startswith("legged_mw/")}
+    assert rounds(package_graph(sources)) == []
+    back = {**sources, "legged_mw/deploy/exam.py": "from legged_mw.unitree.client import UnitreeRobot"}
+    assert rounds(package_graph(back)) == [("deploy", "unitree")]
 
 
 @pytest.mark.parametrize("path", FILES)

@@ -323,7 +323,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
 def start(program: str, folder: Path, *args: str) -> Result:
     """``program`` started in ``folder``, as a user away from the repository does."""
     done = subprocess.run(
-        [sys.executable, str(ROOT / f"{program}.py"), *args], cwd=folder, capture_output=True, text=True, timeout=300
+        [sys.executable, str(ROOT / f"{program}.py"), *args], cwd=folder, capture_output=True, text=True, timeout=1200
     )
     return Result(done.returncode, done.stdout, done.stderr)
 

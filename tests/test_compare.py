@@ -18,7 +18,7 @@ PROGRAM = ROOT / "benchmarks" / "compare.py"
 
 def compare(*args: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(PROGRAM), "--device", "cpu", "--num_envs", "8", "--iterations", "1", *args]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=1200, check=False)
 
 
 def interpreter(path: Path, script: str) -> str:

@@ -54,7 +54,7 @@ def check(tmp_path_factory: pytest.TempPathFactory) -> Check:
     )
     assert built.returncode == 0 and not built.stderr, built.stderr
     return lambda export, record: subprocess.run(
-        [out / "check", export, record], capture_output=True, text=True, timeout=300
+        [out / "check", export, record], capture_output=True, text=True, timeout=1200
     )
 
 

@@ -15,6 +15,7 @@ from program import refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_mw import programs
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import crossing, exam, grading, plots
 from legged_mw.eval.crossing import TILES
@@ -243,7 +244,7 @@ def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest
     root, folder = runs
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     monkeypatch.setattr(crossing, "SECONDS", 0.1)
-    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     draw = plots.sections
     monkeypatch.setattr(plots, "sections", lambda *args: draw(*args)[:2])  # the others are drawn in test_report
     result = run("play", root, *ROUGH, "--device", "cpu", "--eval", "--compare", folder.name, "--set", KINDS)

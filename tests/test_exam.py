@@ -20,7 +20,7 @@ from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw import ROOT
+from legged_mw import ROOT, programs
 from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.exam import contract_rules
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -743,7 +743,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
     monkeypatch.setattr(exam, "SECONDS", 2.1)
-    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     monkeypatch.setattr(plots, "sections", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")
     start = [*SMALL[:2], "--device", "cpu", "--eval"]

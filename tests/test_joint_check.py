@@ -18,7 +18,7 @@ from legged_mw.deploy.robot import Floats, Robot, RobotError
 from legged_mw.deploy.runner import Summary, run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import SOFT
-from legged_mw.deploy.unitree.faults import parse_faults
+from legged_mw.unitree.faults import parse_faults
 from legged_mw.utils.errors import UserError
 from tests.wires import POLICIES, pair
 from tests.wires import domain as domain

@@ -210,6 +210,6 @@ def test_two_commits_are_compared_and_found_once(
 
 def test_what_is_no_commit_is_said() -> None:
     done = subprocess.run(
-        [sys.executable, compare.__file__, "no-such-commit", "HEAD"], capture_output=True, text=True, timeout=300
+        [sys.executable, compare.__file__, "no-such-commit", "HEAD"], capture_output=True, text=True, timeout=1200
     )
     assert done.returncode == 1 and "no-such-commit" in done.stderr and done.stderr.count("\n") == 1

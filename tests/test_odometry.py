@@ -23,8 +23,8 @@ from legged_mw.deploy.robot import QUANTITIES, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.deploy.unitree.client import check_rows
-from legged_mw.deploy.unitree.robots import G1, GO2
+from legged_mw.unitree.client import check_rows
+from legged_mw.unitree.robots import G1, GO2
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.errors import UserError
 

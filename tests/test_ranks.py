@@ -24,7 +24,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(_PATHS), "OMP_NUM_THR
 
 
 def launch(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*LAUNCH, *words], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    return subprocess.run([*LAUNCH, *words], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=1200)
 
 
 def learn(folder: Path, dies_in: int = 0, *more: str) -> subprocess.CompletedProcess[str]:
@@ -149,7 +149,7 @@ time.sleep(60.0 if sys.argv[1] == "2" else 3.0)
         )
         assert child.stdout is not None and child.stdout.readline() == "ready\n"
         child.send_signal(signal.SIGTERM)
-        _, errors = child.communicate(timeout=300)
+        _, errors = child.communicate(timeout=1200)
         assert child.returncode == code and said in errors
 
 

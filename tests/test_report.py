@@ -14,9 +14,9 @@ import torch
 from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 
-from legged_mw import ROOT
+from legged_mw import ROOT, programs
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, exams, grading, page, plots, report
+from legged_mw.eval import exam, exams, page, plots, report
 from legged_mw.eval.page import Column
 from legged_mw.eval.peers import PEERS
 from legged_mw.eval.rollout import Case, Push, roll_out
@@ -317,7 +317,7 @@ def test_compare_grades_each_by_its_own_config(
         write=lambda folder, task, columns, extras: written.extend([folder, task, *columns])
     )
     monkeypatch.setitem(exams.EXAMS, "walking", kind)
-    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
     result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", *small)
     assert result.code == 0, result.err

@@ -359,7 +359,7 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
         if "Learning iteration 2/" in line:
             process.send_signal(signal.SIGTERM)
             break
-    rest, err = process.communicate(timeout=300)
+    rest, err = process.communicate(timeout=1200)
     text = "".join(out) + rest
     assert process.returncode == 3 and "Traceback" not in err, err
     [folder] = (tmp_path / "logs/my runs").iterdir()
@@ -443,7 +443,7 @@ for attempt in range(12):
 def test_kill_while_saving_leaves_whole_checkpoints_only(tmp_path: Path) -> None:
     """SIGKILL at twelve random moments of a process that does nothing but save."""
     done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", KILLED, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=1200
     )
     assert done.returncode == 0, done.stderr
     whole, torn = (int(number) for number in done.stdout.split()[-2:])

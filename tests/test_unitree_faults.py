@@ -11,9 +11,9 @@ import pytest
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import read_contract
-from legged_mw.deploy.unitree.link import RobotEnd, Wire
-from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import SimulatedUnitree
+from legged_mw.unitree.link import RobotEnd, Wire
+from legged_mw.unitree.robots import machine_of
+from legged_mw.unitree.serve import SimulatedUnitree
 from tests.faults import CASES, REFUSED, SOON, Case, limits_of, lockstep
 from tests.wires import POLICIES, locked_domain
 

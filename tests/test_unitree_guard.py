@@ -22,14 +22,14 @@ import pytest
 
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import RobotError
-from legged_mw.deploy.unitree import client, clock, guard, link, program
-from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.faults import Faults, parse_faults
-from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
-from legged_mw.deploy.unitree.handset import Handset
-from legged_mw.deploy.unitree.link import Received, RobotEnd
-from legged_mw.deploy.unitree.remote import encode
-from legged_mw.deploy.unitree.serve import DAMPED, LOW_LEVEL, STEP, SimulatedUnitree
+from legged_mw.unitree import client, clock, guard, link, program
+from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.faults import Faults, parse_faults
+from legged_mw.unitree.guard import Board, Guard, Guarded
+from legged_mw.unitree.handset import Handset
+from legged_mw.unitree.link import Received, RobotEnd
+from legged_mw.unitree.remote import encode
+from legged_mw.unitree.serve import DAMPED, LOW_LEVEL, STEP, SimulatedUnitree
 from tests.wires import POLICIES
 from tests.wires import domain as domain
 
@@ -287,7 +287,7 @@ import select, sys, time
 from pathlib import Path
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import RobotError
-from legged_mw.deploy.unitree import client, clock, guard
+from legged_mw.unitree import client, clock, guard
 folder, domain, fault = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 contract = read_contract(folder)
 # it damps for its fault, not because this computer is busy
@@ -312,7 +312,7 @@ while True:
 # The program on a computer that may be busy: nothing is late here, as what is late is tested above and in lockstep.
 DEPLOY = """
 from legged_mw.deploy import safety
-from legged_mw.deploy.unitree import client, guard
+from legged_mw.unitree import client, guard
 guard.LATE = guard.STILL = client.TOO_OLD = 60.0
 safety.LATE = 1e9  # [periods]
 from legged_mw.deploy.__main__ import main
@@ -534,14 +534,14 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
                 break
         time.sleep(2.0)  # it walks
         policy.send_signal(signal.SIGINT)
-        rest, errors = policy.communicate(timeout=300)
+        rest, errors = policy.communicate(timeout=1200)
         assert policy.returncode == 0, errors
         assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in rest, (
             said + rest + errors
         )
         assert "zero torque: " in said and "stand: " in said and "policy: select: damping" in said, said
         robot.send_signal(signal.SIGINT)
-        said, errors = robot.communicate(timeout=300)
+        said, errors = robot.communicate(timeout=1200)
         assert "from a state to the first command that answers it: median " in said and "0 refused" in said, errors
         assert "degrees from upright" in said
 

@@ -17,11 +17,11 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows
-from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
-from legged_mw.deploy.unitree.robots import G1, GO2, H1
-from legged_mw.deploy.unitree.serve import Faults, SimulatedUnitree
+from legged_mw.unitree.client import UnitreeRobot, check_rows
+from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
+from legged_mw.unitree.robots import G1, GO2, H1
+from legged_mw.unitree.serve import Faults, SimulatedUnitree
 from tests.wires import POLICIES, pair
 from tests.wires import domain as domain
 

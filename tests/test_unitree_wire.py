@@ -14,16 +14,15 @@ import numpy as np
 import pytest
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
 
-from legged_mw import ROOT
+from legged_mw import ROOT, unitree
 from legged_mw.deploy import __main__ as deploy
-from legged_mw.deploy import unitree
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import BUTTONS, RobotError
-from legged_mw.deploy.unitree import handset, idl, link
-from legged_mw.deploy.unitree.codec import LAYOUTS, STRUCTS, Message, crc32, fields
-from legged_mw.deploy.unitree.faults import KINDS, Faults, parse_faults
-from legged_mw.deploy.unitree.remote import decode, encode
-from legged_mw.deploy.unitree.robots import G1, GO2, H1, check_body, machine_of, order
+from legged_mw.unitree import handset, idl, link
+from legged_mw.unitree.codec import LAYOUTS, STRUCTS, Message, crc32, fields
+from legged_mw.unitree.faults import KINDS, Faults, parse_faults
+from legged_mw.unitree.remote import decode, encode
+from legged_mw.unitree.robots import G1, GO2, H1, check_body, machine_of, order
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.errors import UserError
 from tests.wires import POLICIES

@@ -42,7 +42,7 @@ def start(installed: Path, folder: Path, *args: str) -> str:
     program += "from legged_mw.programs import main; main()"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), libraries])}
     command = [sys.executable, "-S", "-c", program, *args]  # -S: an editable install of the clone stays out
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr
     where, _, out = done.stdout.partition("\n")
     assert where == str(installed / "legged_mw/__init__.py")

@@ -19,10 +19,10 @@ from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
-from legged_mw.deploy.unitree.link import LEASE, RobotEnd, Wire
-from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
+from legged_mw.unitree.client import Direct, UnitreeRobot
+from legged_mw.unitree.link import LEASE, RobotEnd, Wire
+from legged_mw.unitree.robots import machine_of
+from legged_mw.unitree.serve import STEP, SimulatedUnitree
 
 POLICIES = ROOT / "resources" / "policies"
 

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import math
-import sys
-from contextlib import closing
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.drive import lift
 from legged_mw.deploy.odometry import CONTACTS
-from legged_mw.deploy.unitree import client
-from legged_mw.deploy.unitree.client import UnitreeRobot
-from legged_mw.deploy.unitree.robots import machine_of
+from legged_mw.deploy.robot import Robot
 from legged_mw.utils.errors import UserError
 
 ROBOTS = ("simulated", "unitree")
@@ -83,37 +80,21 @@ def check_flags(args: argparse.Namespace) -> None:
         raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")
 
 
+def driver(name: str) -> Any:
+    """The module that speaks with robots of that kind; its package is imported only here."""
+    return import_module(f"legged_mw.{name}.driver")
+
+
 def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
     """A simulated robot on the wire."""
-    from legged_mw.deploy.unitree import handset, need_dds, program
-    from legged_mw.deploy.unitree.faults import parse_faults
-
-    need_dds()
-    faults = parse_faults(args.fault or [], contract.joints)
-    script, keys = (
-        handset.load_remote(Path(args.remote)) if args.remote else [],
-        args.remote is None and sys.stdin.isatty(),
-    )
-    if keys:
-        print(handset.KEYS_HELP)
-    with closing(handset.Handset(script, keys)) as hand:
-        served = program.serve(
-            *(folder, contract, args.interface, args.domain),
-            seconds=args.time or math.inf,
-            handset=hand,
-            faults=faults,
-            watchdog=args.watchdog or math.inf,
-            hoist=None if args.hoist is None else args.hoist != "no",
-            lift=lift(args),
-        )
-    print(served.text())
+    print(driver(args.serve).serve(folder, contract, args, lift(args)))
 
 
 def contact(args: argparse.Namespace, contract: Contract) -> str | None:
     """How leg odometry finds feet on the ground; None without odometry. Raises RobotError."""
     if args.velocity != ODOMETRY:
         return None
-    feels = args.robot == "simulated" or bool(machine_of(contract.joints).feet)
+    feels = args.robot == "simulated" or driver(args.robot).senses_feet(contract)
     if args.contact == CONTACTS[0] and not feels:
         raise UserError(
             f"--contact {args.contact}: this robot does not measure it; there are: {', '.join(CONTACTS[1:])}"
@@ -121,11 +102,6 @@ def contact(args: argparse.Namespace, contract: Contract) -> str | None:
     return args.contact or CONTACTS[not feels]
 
 
-def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> UnitreeRobot:
+def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> Robot:
     """The robot on the wire."""
-    robot = client.connect(folder, contract, args.interface, args.domain, odometry=args.velocity == ODOMETRY)
-    print(
-        f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V",
-        flush=True,
-    )
-    return robot
+    return driver(args.robot).connect(folder, contract, args, odometry=args.velocity == ODOMETRY)

@@ -104,6 +104,7 @@ class Robot(ABC):
     can_change_gains = False  # whether `write` obeys stiffness and damping
     motors: Mapping[str, int] = {}  # joint -> number of its motor, where motors have numbers
     limits: Mapping[str, float] = {}  # of this machine, which no contract knows: names and units as in safety.Limits
+    report: str = ""  # after `close`: what happened on the way to it, in words
 
     @abstractmethod
     def read(self) -> Measurement:

@@ -44,12 +44,11 @@ class _Caught(BaseException):
         self.parser = parser
 
 
-def main() -> None:
+def main(programs: Mapping[str, Callable[[], None]]) -> None:
+    """Print the script that completes ``programs``."""
     parser = Parser(prog="legged-mw completion", description=__doc__, allow_abbrev=False)
     parser.add_argument("shell", choices=("bash", "zsh"))
-    from legged_mw.programs import PROGRAMS  # which names this program
-
-    print(script(parser.parse_args().shell, PROGRAMS))
+    print(script(parser.parse_args().shell, programs))
 
 
 def script(shell: str, programs: Mapping[str, Callable[[], None]]) -> str:

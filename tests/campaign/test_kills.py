@@ -17,6 +17,6 @@ def test_five_kills_lose_nothing() -> None:
         "5",
         "--no_export",
     ]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(program, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "'kills': 5" in done.stdout

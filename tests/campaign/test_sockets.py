@@ -22,11 +22,11 @@ import pytest
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import QUANTITIES, Floats, Health, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.deploy.unitree import remote
-from legged_mw.deploy.unitree.client import UnitreeRobot
-from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.link import Received, Wire
-from legged_mw.deploy.unitree.serve import SimulatedUnitree
+from legged_mw.unitree import remote
+from legged_mw.unitree.client import UnitreeRobot
+from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.link import Received, Wire
+from legged_mw.unitree.serve import SimulatedUnitree
 from legged_mw.view.drive import Pilot
 from legged_mw.view.gate import MOST, Gate, is_local
 from legged_mw.view.stage import Moment, ViewError

@@ -11,7 +11,7 @@ from attack import Case, attack, program
 from golden.yaml_files import TEXTS
 
 from legged_mw import ROOT
-from legged_mw.deploy.unitree.handset import load_remote
+from legged_mw.unitree.handset import load_remote
 from legged_mw.utils import yaml_file
 from legged_mw.utils.yaml_file import load_yaml
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from golden.table import Table
 from legged_mw.deploy import safety
-from legged_mw.deploy.unitree import handset
-from legged_mw.deploy.unitree.faults import parse_faults
+from legged_mw.unitree import handset
+from legged_mw.unitree.faults import parse_faults
 from legged_mw.utils.commands import command_table
 from legged_mw.utils.task import load_task
 from legged_mw.view.script import load_script

@@ -28,11 +28,11 @@ from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import MujocoRobot
-from legged_mw.deploy.unitree import link, need_dds
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, check_rows
-from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.link import Received, Wire
-from legged_mw.deploy.unitree.robots import G1, GO2, check_body, machine_of
+from legged_mw.unitree import link, need_dds
+from legged_mw.unitree.client import Direct, UnitreeRobot, check_rows
+from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.link import Received, Wire
+from legged_mw.unitree.robots import G1, GO2, check_body, machine_of
 
 GO2_FLAT = ROOT / "resources/policies/go2_flat"
 CONTRACT = read_contract(GO2_FLAT)

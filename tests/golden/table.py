@@ -191,9 +191,9 @@ def lines(area: str, table: Table, folder: Path) -> Iterator[str]:
 
 
 BEYOND = {  # raises that no case can come to, or none that is cheap: file -> why
-    "deploy/unitree/codec.py": "a message of another size: the wire drops it before",
-    "deploy/unitree/guard.py": "needs a guard process: tests/test_unitree_guard.py",
-    "deploy/unitree/link.py": "needs a wire",
+    "unitree/codec.py": "a message of another size: the wire drops it before",
+    "unitree/guard.py": "needs a guard process: tests/test_unitree_guard.py",
+    "unitree/link.py": "needs a wire",
     "envs/base_task.py": "a mistake of a program's, not of a user's",
     "eval/rollout.py": "a mistake of a program's, not of a user's",
     "rl/training.py": "ends a training that has begun: tests/campaign/test_disk.py, tests/test_ranks.py",

@@ -17,10 +17,10 @@ from legged_mw.deploy.motion import ATTITUDE, PLACE
 from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.deploy.unitree import clock, need_dds
-from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.remote import decode
-from legged_mw.deploy.unitree.robots import Machine, check_body, check_slots, machine_of, order
+from legged_mw.unitree import clock, need_dds
+from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.remote import decode
+from legged_mw.unitree.robots import Machine, check_body, check_slots, machine_of, order
 
 TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
 TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
@@ -266,8 +266,8 @@ def connect(
 ) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
-    from legged_mw.deploy.unitree.guard import LATE, Guarded
-    from legged_mw.deploy.unitree.link import LOOPBACK, default_domain
+    from legged_mw.unitree.guard import LATE, Guarded
+    from legged_mw.unitree.link import LOOPBACK, default_domain
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine, odometry)

@@ -20,10 +20,10 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from legged_mw.deploy.robot import RobotError
-from legged_mw.deploy.unitree import clock
-from legged_mw.deploy.unitree.codec import LAYOUTS
-from legged_mw.deploy.unitree.idl import RAW, TYPES, wrong_hash
-from legged_mw.deploy.unitree.robots import known_motors
+from legged_mw.unitree import clock
+from legged_mw.unitree.codec import LAYOUTS
+from legged_mw.unitree.idl import RAW, TYPES, wrong_hash
+from legged_mw.unitree.robots import known_motors
 from legged_mw.utils.errors import printable, unknown
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"

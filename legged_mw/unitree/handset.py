@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from legged_mw.deploy.robot import BUTTONS
-from legged_mw.deploy.unitree.remote import encode
+from legged_mw.unitree.remote import encode
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 

@@ -28,8 +28,8 @@ from typing import Any, NamedTuple
 
 from legged_mw.deploy.loop import Spread, real_time
 from legged_mw.deploy.robot import RobotError
-from legged_mw.deploy.unitree import clock
-from legged_mw.deploy.unitree.codec import LAYOUTS
+from legged_mw.unitree import clock
+from legged_mw.unitree.codec import LAYOUTS
 
 # [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
 LATE = 0.06
@@ -146,7 +146,7 @@ class Guarded:
 
         ``find``: [s] to wait for the robot's first state. Raises RobotError with the guard's error.
         """
-        from legged_mw.deploy.unitree.link import Commander
+        from legged_mw.unitree.link import Commander
 
         size, commander = LAYOUTS[package, "LowState_"].size, Commander(package, interface, domain)
         with tempfile.TemporaryFile() as file:
@@ -177,7 +177,7 @@ class Guarded:
         return owner
 
     def receive(self) -> Any:
-        from legged_mw.deploy.unitree.link import Received
+        from legged_mw.unitree.link import Received
 
         now = self._clock()  # before the board: a pause between the two is not the guard's
         body, stamp, text, turn = self._board.get()
@@ -400,7 +400,7 @@ def _name(number: int) -> str:
 
 
 def main() -> None:
-    from legged_mw.deploy.unitree.link import Wire, claim
+    from legged_mw.unitree.link import Wire, claim
 
     settings = json.loads(sys.argv[1])
     channel = socket.socket(fileno=settings["channel"])

@@ -11,7 +11,7 @@ from typing import Any
 
 from cyclonedds.idl import annotations, make_idl_struct, types
 
-from legged_mw.deploy.unitree.codec import HEADER, LAYOUTS, STRUCTS, fields
+from legged_mw.unitree.codec import HEADER, LAYOUTS, STRUCTS, fields
 
 # Complete XTypes hashes that Unitree's own C++ processes (Cyclone 0.10.2) announce.
 HASHES = {

@@ -13,11 +13,11 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.loop import Spread, real_time
-from legged_mw.deploy.unitree import need_dds
-from legged_mw.deploy.unitree.faults import Fault
-from legged_mw.deploy.unitree.handset import Handset
-from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import STEP, Record, SimulatedUnitree
+from legged_mw.unitree import need_dds
+from legged_mw.unitree.faults import Fault
+from legged_mw.unitree.handset import Handset
+from legged_mw.unitree.robots import machine_of
+from legged_mw.unitree.serve import STEP, Record, SimulatedUnitree
 
 BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
 PRIORITY = 10  # ours, of a real-time process: below those of a policy
@@ -135,7 +135,7 @@ def serve(
 ) -> Served:
     """A simulated robot of the export on a network interface."""
     need_dds()
-    from legged_mw.deploy.unitree.link import RobotEnd, default_domain
+    from legged_mw.unitree.link import RobotEnd, default_domain
 
     real_time(PRIORITY, heirs=True)  # a robot's own computer does nothing else either
     domain = default_domain(interface) if domain is None else domain

@@ -22,10 +22,10 @@ from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.robot import Floats, damped
 from legged_mw.deploy.safety import limits_of
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.faults import NAN, SWAPS, Faults, Line
-from legged_mw.deploy.unitree.remote import encode
-from legged_mw.deploy.unitree.robots import Machine, machine_of, order
+from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.faults import NAN, SWAPS, Faults, Line
+from legged_mw.unitree.remote import encode
+from legged_mw.unitree.robots import Machine, machine_of, order
 
 STEP = 0.002  # [s]; robots send their state at 500 Hz
 # in q and dq: no control of the position, of the velocity [unitree_sdk2]

@@ -1,0 +1,53 @@
+"""What ``legged_mw.deploy --robot unitree`` and ``--serve unitree`` call: deploy finds this module by the name of the flag's value."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from contextlib import closing
+from pathlib import Path
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.robot import Robot
+from legged_mw.unitree import client, need_dds
+from legged_mw.unitree.robots import machine_of
+
+
+def senses_feet(contract: Contract) -> bool:
+    """Whether the contract's robot measures its feet's contacts."""
+    return bool(machine_of(contract.joints).feet)
+
+
+def connect(folder: Path, contract: Contract, args: argparse.Namespace, odometry: bool) -> Robot:
+    """The robot on the wire."""
+    robot = client.connect(folder, contract, args.interface, args.domain, odometry=odometry)
+    print(
+        f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V",
+        flush=True,
+    )
+    return robot
+
+
+def serve(folder: Path, contract: Contract, args: argparse.Namespace, lift: float) -> str:
+    """A simulated robot on the wire; ``lift`` [m]: how far above its start it hangs. Returns what happened, in words."""
+    need_dds()
+    from legged_mw.unitree import handset, program
+    from legged_mw.unitree.faults import parse_faults
+
+    faults = parse_faults(args.fault or [], contract.joints)
+    script = handset.load_remote(Path(args.remote)) if args.remote else []
+    keys = args.remote is None and sys.stdin.isatty()
+    if keys:
+        print(handset.KEYS_HELP)
+    with closing(handset.Handset(script, keys)) as hand:
+        served = program.serve(
+            *(folder, contract, args.interface, args.domain),
+            seconds=args.time or math.inf,
+            handset=hand,
+            faults=faults,
+            watchdog=args.watchdog or math.inf,
+            hoist=None if args.hoist is None else args.hoist != "no",
+            lift=lift,
+        )
+    return served.text()
