@@ -27,7 +27,7 @@ import onnxruntime  # before threads are counted: the package starts one of its 
 
 from legged_mw.deploy.__main__ import find
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract, read_contract
-from legged_mw.deploy.inputs import START, WALK, Wish
+from legged_mw.deploy.inputs import START, WALK, DriveInput
 from legged_mw.deploy.log import Log, read_log
 from legged_mw.deploy.loop import Loop, Spread
 from legged_mw.deploy.policy import Controller
@@ -65,7 +65,7 @@ class Walker:
         self._ends = [0.5 * np.array([getattr(each, side) for each in contract.commands]) for side in ("high", "low")]
         self._period, self._step = contract.period, -1
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         self._step += 1
         now = self._step * self._period
         pressed = {round(1.0 / self._period): START, round(4.0 / self._period): WALK}.get(self._step)
@@ -74,7 +74,7 @@ class Walker:
         if turn % 2:
             place = turn // 2 % len(command)
             command[place] = self._ends[turn // 2 // len(command) % 2][place]
-        return Wish(frozenset([pressed] if pressed else ()), command)
+        return DriveInput(frozenset([pressed] if pressed else ()), command)
 
     def let_go(self) -> None: ...
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from legged_mw.deploy.contract import Contract
-from legged_mw.deploy.inputs import Wish
+from legged_mw.deploy.inputs import DriveInput
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.runner import Summary, run
@@ -25,10 +25,10 @@ class Script:
         self.presses, self.stop, self.step = presses, stop, -1
         self.command = None if command is None else np.array(command, dtype=float)
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         self.step += 1
         pressed = frozenset({self.presses[self.step]} if self.step in self.presses else ())
-        return Wish(pressed, self.command, "the test" if self.step == self.stop else "")
+        return DriveInput(pressed, self.command, "the test" if self.step == self.stop else "")
 
     def let_go(self) -> None: ...
 

@@ -26,10 +26,10 @@ from legged_mw.deploy.states import States
 from legged_mw.unitree.client import UnitreeRobot
 from legged_mw.unitree.codec import Message
 from legged_mw.unitree.faults import Faults, parse_faults
-from legged_mw.unitree.guard import Board, Guard, Guarded
+from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.link import RobotEnd, Wire
 from legged_mw.unitree.remote import encode
-from legged_mw.unitree.serve import STEP, Record, SimulatedUnitree
+from legged_mw.unitree.serve import STEP, ServedRecord, SimulatedUnitree
 
 ALONE = 0.22  # [s] of 12 measurements, in which a part that is frozen alone can be known
 SOON = 0.1  # [s] within which joints must be damped
@@ -183,7 +183,7 @@ class Rig:
 class Stepped(Guarded):
     """A guard that runs when somebody waits for it."""
 
-    guard: Guard
+    guard: WireGuard
 
     def _answer(self) -> dict[str, Any]:
         if hasattr(self, "guard"):
@@ -203,7 +203,7 @@ class Lockstep(Rig):
             file.truncate(8192)
             here, there = socket.socketpair()
             board = Board(file.fileno(), len(self.sim._state.body))
-            self.guard = Guard(
+            self.guard = WireGuard(
                 wire, there, Board(file.fileno(), len(self.sim._state.body)), package, clock=self.late_clock
             )
         self.sim.step()
@@ -264,7 +264,7 @@ def lockstep(case: Case, sim: SimulatedUnitree, wire: Wire, folder: Path, patch:
     """Run one fault; the robot's record and what was said are in what comes back. ``patch``: pytest's monkeypatch."""
     for name, value in () if case.from_start else (("RISE", RISE), ("STANDS", 1.0)):
         patch.setattr(f"legged_mw.deploy.states.{name}", value)
-    sim.faults, sim.record, sim.remote, sim._rng = Faults(), Record(), encode(), np.random.default_rng(0)
+    sim.faults, sim.record, sim.remote, sim._rng = Faults(), ServedRecord(), encode(), np.random.default_rng(0)
     sim.reset(after=1.0)
     while wire.receive() or wire.other_commander() or sim.end.receive():  # of the fault before
         pass

@@ -21,7 +21,7 @@ import pytest
 from legged_mw import ROOT
 from legged_mw.deploy import drive
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.mirror import ACTIONS, Mirror, MirroredStage, MirrorSession
+from legged_mw.deploy.mirror import ACTIONS, MirroredStage, MirrorSession, RobotMonitor
 from legged_mw.deploy.robot import Health, Measurement
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.view.drive import Pilot
@@ -43,7 +43,7 @@ class Ends:
         mine, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         for end in (mine, theirs):
             end.setblocking(False)
-        self.mirror = Mirror.__new__(Mirror)
+        self.mirror = RobotMonitor.__new__(RobotMonitor)
         self.mirror.begin(contract, mine)
         self.stage = MirroredStage(GO2, theirs)
         self.shown: list[Moment] = []
@@ -166,12 +166,12 @@ def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:
         pytest.skip(reason)
     port = free_port("127.0.0.1")
     args = argparse.Namespace(viewer="web", camera="follow", host="127.0.0.1", port=port)
-    with closing(Mirror(GO2, contract, args)) as mirror:
+    with closing(RobotMonitor(GO2, contract, args)) as mirror:
         mirror.show(0.0, measurement(contract), state("stand", ""))
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
             assert page.status == 200 and b"<html" in page.read().lower()
         with pytest.raises(ViewError, match=f"--port {port} is in use on 127.0.0.1"):
-            Mirror(GO2, contract, args)
+            RobotMonitor(GO2, contract, args)
         process = mirror._process
         assert process.poll() is None
     assert process.poll() is not None
@@ -183,7 +183,7 @@ def test_a_viewer_that_ends_at_once_is_not_waited_for(contract: Contract, monkey
     with pytest.raises(
         ViewError, match="the viewer did not start: it ended, or took longer than 30 s; leave --viewer out"
     ):
-        Mirror(GO2, contract, args)
+        RobotMonitor(GO2, contract, args)
 
 
 # ---- who else may drive

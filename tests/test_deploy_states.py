@@ -23,7 +23,7 @@ from drivers import Script, Watched, driven
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, StopFile, Wish, from_sticks
+from legged_mw.deploy.inputs import DriveInput, Gamepad, Keys, RobotRemote, StopFile, from_sticks
 from legged_mw.deploy.log import read_log
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Health, Measurement, Remote, RobotError
@@ -145,7 +145,7 @@ def test_the_robots_remote(contract: Contract) -> None:
     """A button counts once however long it is held; L2 and B together stop."""
     remote = RobotRemote(contract.commands)
 
-    def poll(*buttons: str) -> Wish:
+    def poll(*buttons: str) -> DriveInput:
         return remote.poll(Health(remote=Remote(frozenset(buttons))))
 
     assert [poll("start", "X").pressed, poll("start").pressed, poll().pressed, poll("start").pressed] == [
@@ -155,18 +155,18 @@ def test_the_robots_remote(contract: Contract) -> None:
         {"start"},
     ]
     assert poll("L2").stop == poll("B").stop == "" and poll("L2", "B").stop == "the remote's emergency stop (L2 + B)"
-    assert remote.poll(Health()) == Wish()
+    assert remote.poll(Health()) == DriveInput()
 
 
 def test_keys(contract: Contract) -> None:
     read, write = os.pipe()
     keys = Keys(contract.commands, read)
 
-    def press(text: str) -> Wish:
+    def press(text: str) -> DriveInput:
         os.write(write, text.encode())
         return keys.poll(Health())
 
-    assert keys.poll(Health()) == Wish()
+    assert keys.poll(Health()) == DriveInput()
     assert press("s").pressed == {"start"} and press("a").pressed == {"A"} and press("x").pressed == {"select"}
     wish = press("\x1b[A\x1b[A\x1b[Cq")
     np.testing.assert_allclose(wish.command, [0.6, -0.16, 0.24])  # a fifth of the range each
@@ -189,11 +189,11 @@ def test_a_gamepad(contract: Contract, tmp_path: Path) -> None:
     keep = os.open(fifo, os.O_RDWR)
     pad = Gamepad(fifo, contract.commands)
 
-    def feel(*events: tuple[int, int, int]) -> Wish:
+    def feel(*events: tuple[int, int, int]) -> DriveInput:
         os.write(keep, b"".join(struct.pack("<IhBB", 0, *event) for event in events))
         return pad.poll(Health())
 
-    assert feel((0, 0x81, 0), (0, 0x82, 1)) == Wish()  # as it is at the opening
+    assert feel((0, 0x81, 0), (0, 0x82, 1)) == DriveInput()  # as it is at the opening
     assert feel((1, 1, 7), (0, 1, 7)).pressed == {"start"}  # pressed and let go between two steps
     assert feel((1, 1, 0)).pressed == {"A"} and feel((1, 1, 6)).pressed == {"select"}
     np.testing.assert_allclose(feel((-32767, 2, 1), (32767, 2, 3)).command, [1.5, 0.0, -1.2])
@@ -210,7 +210,7 @@ def test_a_gamepad(contract: Contract, tmp_path: Path) -> None:
 def test_a_file_descriptor_stops(how: str) -> None:
     read, write = os.pipe()
     stop = StopFile(read)
-    assert stop.poll(Health()) == Wish()
+    assert stop.poll(Health()) == DriveInput()
     os.write(write, b"!") if how == "written" else os.close(write)
     assert stop.poll(Health()).stop == f"file descriptor {read}"
     os.close(read)

@@ -168,7 +168,7 @@ def test_share_of_time_at_a_motors_envelope() -> None:
     speed = np.repeat([0.0, 15.0, 15.0], [20, 30, 50])[:, None, None].repeat(3, axis=2)
     torque = np.repeat([-15.0, 8.0, 7.0], [20, 30, 50])[:, None, None].repeat(3, axis=2)
     torque[:, :, 1] = 0.0
-    limits = motors.Limits(
+    limits = motors.MotorLimits(
         *(np.array([sign * 15.0, sign * 15.0, sign * np.inf]) for sign in (-1.0, 1.0)),
         *(np.array([value, value, np.inf]) for value in (20.0, 25.0)),
     )

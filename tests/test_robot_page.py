@@ -19,7 +19,7 @@ from legged_mw.envs.statistics import BrokenWorlds, DivergenceStop
 from legged_mw.robot import __main__ as program
 from legged_mw.robot import picture
 from legged_mw.robot.draft import Draft, as_env, draft, table
-from legged_mw.robot.measure import Health, Joint, inside_by, measure, tilt
+from legged_mw.robot.measure import Joint, RobotNumbers, inside_by, measure, tilt
 from legged_mw.robot.new import config_text, write
 from legged_mw.robot.page import page
 from legged_mw.robot.picture import HEIGHT, WIDTH, Label, _columns
@@ -61,7 +61,7 @@ def wheel(
     return build_model(file, **{**plain, **choices})
 
 
-def health(robot: RobotModel, height: float = 0.1) -> Health:
+def health(robot: RobotModel, height: float = 0.1) -> RobotNumbers:
     return measure(robot, [0.0] * len(robot.joint_names), [0.0, 0.0, height])
 
 
@@ -149,7 +149,7 @@ def test_a_damping_that_the_step_does_not_bear(tmp_path: Path) -> None:
     assert calm.stand.end == "stands" and "implicitfast; servos in the air: stable" in page(calm, "it")
 
 
-def health_of(found: Draft, file: Path) -> Health:
+def health_of(found: Draft, file: Path) -> RobotNumbers:
     return measure(as_env(found, file).robot, found.pose, found.place)
 
 

@@ -21,7 +21,7 @@ from legged_mw.deploy.simulated import Fleet
 from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import getup, handstand, strip
 from legged_mw.eval.perform import machine, on_ground
-from legged_mw.eval.skill import Ground, Recording, Robot
+from legged_mw.eval.skill import ExamGround, ExamRobot, Recording
 from legged_mw.skills.drop_states import fallen
 from legged_mw.skills.getup import Getup
 from legged_mw.skills.handstand import Handstand
@@ -46,14 +46,14 @@ def go1() -> Getup:
 
 
 @pytest.fixture(scope="module")
-def robot(go1: Getup) -> Robot:
+def robot(go1: Getup) -> ExamRobot:
     return machine(go1)
 
 
 # ---- falls
 
 
-def test_falls_are_settled_and_made_again(robot: Robot) -> None:
+def test_falls_are_settled_and_made_again(robot: ExamRobot) -> None:
     """They lie: low, slow, nothing far below the ground; the same seed makes the same, and fewer are the first of more."""
     qpos, qvel = fallen(robot.model, 12, seed=3, seconds=1.0)
     again, _ = fallen(robot.model, 5, seed=3, seconds=1.0)
@@ -133,7 +133,7 @@ def test_pull_lifts_and_fades() -> None:
 # ---- what an exam makes of a recording
 
 
-def recording(robot: Robot, seconds: float, count: int) -> Recording:
+def recording(robot: ExamRobot, seconds: float, count: int) -> Recording:
     """Robots that stand."""
     steps, joints = round(seconds / robot.dt), robot.model.nv - 6
     qpos = np.tile(robot.home, (steps, count, 1))
@@ -142,9 +142,9 @@ def recording(robot: Robot, seconds: float, count: int) -> Recording:
     )
 
 
-def test_what_getup_judges(robot: Robot) -> None:
+def test_what_getup_judges(robot: ExamRobot) -> None:
     """Up at once; up after 2 s; too late; down again after 3 s; never; up, but an episode ended."""
-    skill = getup.Getup(within=3.0)
+    skill = getup.GetupExam(within=3.0)
     seen = recording(robot, skill.seconds, 6)
     at = {seconds: round(seconds / robot.dt) for seconds in (2.0, 3.0, 3.1)}
     seen.qpos[: at[2.0], 1, 2] = 0.1
@@ -168,7 +168,7 @@ def test_what_getup_judges(robot: Robot) -> None:
 
 def test_upright_is_by_gravity() -> None:
     """On a slope of 10 degrees a robot that stands along the slope is 10 degrees off, and still up; one that leans 25 is not."""
-    env = on_ground(make("go1_getup", falls__states=4), Ground(slope=10.0, friction=0.4))
+    env = on_ground(make("go1_getup", falls__states=4), ExamGround(slope=10.0, friction=0.4))
     assert env.robot.physics.geom("floor").friction[0] == 0.4
     expected = torch.tensor([math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))])
     torch.testing.assert_close(env.gravity_dir[0], expected, atol=1e-6, rtol=0.0)
@@ -186,7 +186,7 @@ def test_handstand_rewards_and_judge() -> None:
     env._refresh_base()
     torch.testing.assert_close(env._reward_stand_attitude(), torch.tensor([0.25, 1.0, 0.0]), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(env._reward_stand_height(), torch.tensor([math.exp(0.278 - 0.55), 1.0, 1.0]))
-    skill, here = handstand.Handstand(nose=-1.0, height=0.55, hands=["FR", "FL"]), machine(env)
+    skill, here = handstand.HandstandExam(nose=-1.0, height=0.55, hands=["FR", "FL"]), machine(env)
     seen = recording(here, skill.seconds, 4)
     seen.qpos[:, :3, 2], seen.qpos[:, :3, 3:7] = 0.6, NOSE_DOWN
     seen.qpos[round(4.0 / here.dt), 1, 3:7] = [1.0, 0.0, 0.0, 0.0]  # at 4 s: 4 s before, 4 s after
@@ -208,9 +208,9 @@ def test_handstand_rewards_and_judge() -> None:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exams of a few robots and of a second."""
-    monkeypatch.setattr(getup.Getup, "robots", 3)
+    monkeypatch.setattr(getup.GetupExam, "robots", 3)
     monkeypatch.setattr(
-        getup.Getup, "grounds", {"plane": Ground(), "changed": Ground(slope=10.0, friction=0.3, load=2.0)}
+        getup.GetupExam, "grounds", {"plane": ExamGround(), "changed": ExamGround(slope=10.0, friction=0.3, load=2.0)}
     )
     monkeypatch.setattr(getup, "SETTLING", 0.4)
     monkeypatch.setattr(getup, "STAY", 0.2)
@@ -239,7 +239,9 @@ def test_getup_from_training_to_deploy(tmp_path: Path, small: None) -> None:
     assert run_skill(folder / "export") == there["exam"]
     line = refused(tmp_path, "play", "--task", "go1_getup", "--device", "cpu", "--eval", "--set", "falls.pull=0.1")
     assert "--eval sets falls.pull itself" in line
-    leaning = Fleet(folder / "export", contract, 1, threads=1, change=lambda model: put_on(model, Ground(slope=10.0)))
+    leaning = Fleet(
+        folder / "export", contract, 1, threads=1, change=lambda model: put_on(model, ExamGround(slope=10.0))
+    )
     np.testing.assert_allclose(
         leaning.read().gravity[0], [math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))], atol=1e-9
     )

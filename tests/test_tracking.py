@@ -14,8 +14,8 @@ from legged_mw.deploy.exam import run_skill
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval.perform import machine
-from legged_mw.eval.skill import PUSH_EVERY, Ground, Recording
-from legged_mw.eval.tracking import Tracking
+from legged_mw.eval.skill import PUSH_EVERY, ExamGround, Recording
+from legged_mw.eval.tracking import TrackingExam
 from legged_mw.rl.export import export
 from legged_mw.skills.clip import Clip, read_clip, save_clip
 from legged_mw.skills.motion_reference import angle_between
@@ -193,7 +193,7 @@ def test_the_step_can_be_recorded(left_out: dict[str, list[str]], rows: int) -> 
 
 def test_the_exam_judges_places_at_the_anchor() -> None:
     env = make(worlds=1)
-    robot, exam = machine(env), Tracking()
+    robot, exam = machine(env), TrackingExam()
     assert robot.motion
     frames = exam.steps(robot)
     assert frames == 351
@@ -218,11 +218,11 @@ def test_the_exam_judges_places_at_the_anchor() -> None:
 
 
 def test_each_robot_is_pushed_once_every_two_seconds() -> None:
-    ground, steps = Ground(push=0.5), round(PUSH_EVERY / 0.02)
+    ground, steps = ExamGround(push=0.5), round(PUSH_EVERY / 0.02)
     jumps = [ground.pushes(step, 32, 0.02) for step in range(1, steps + 1)]
     total = sum(np.linalg.norm(jump, axis=1) for jump in jumps if jump is not None)
     np.testing.assert_allclose(total, 0.5)
-    assert ground.pushes(0, 32, 0.02) is None and Ground().pushes(steps, 32, 0.02) is None
+    assert ground.pushes(0, 32, 0.02) is None and ExamGround().pushes(steps, 32, 0.02) is None
 
 
 # ---- the export

@@ -25,7 +25,7 @@ from legged_mw.deploy.robot import RobotError
 from legged_mw.unitree import client, clock, guard, link, program
 from legged_mw.unitree.codec import LAYOUTS, Message
 from legged_mw.unitree.faults import Faults, parse_faults
-from legged_mw.unitree.guard import Board, Guard, Guarded
+from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.handset import Handset
 from legged_mw.unitree.link import Received, RobotEnd
 from legged_mw.unitree.remote import encode
@@ -66,7 +66,7 @@ class Bench:
         self._file.truncate(4096)
         self.here, there = socket.socketpair()
         self.board, size = Board(self._file.fileno(), 64), 64
-        self.guard = Guard(self.wire, there, Board(self._file.fileno(), size), "unitree_go", late)
+        self.guard = WireGuard(self.wire, there, Board(self._file.fileno(), size), "unitree_go", late)
         self._thread = threading.Thread(target=self.guard.run, daemon=True)
         self._thread.start()
 

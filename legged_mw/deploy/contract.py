@@ -15,8 +15,8 @@ import numpy as np
 
 from legged_mw.deploy.action import Action, check_pose, read_action, short
 from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
-from legged_mw.deploy.memory import MEMORY, Memory, read_memory
-from legged_mw.deploy.motion import JOINT_POS, JOINT_VEL, MOTION, PLACE, REFERENCE, TURN, Motion, read_motion
+from legged_mw.deploy.memory import MEMORY, NetworkMemory, read_memory
+from legged_mw.deploy.motion import JOINT_POS, JOINT_VEL, MOTION, PLACE, REFERENCE, TURN, FollowedMotion, read_motion
 from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
 from legged_mw.deploy.reader import MOST_VALUES, Reader, is_list, is_number
 from legged_mw.deploy.reader import ContractError as ContractError
@@ -150,10 +150,10 @@ class Contract:
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
     safety: Mapping[str, Any] | None = None  # limits by name, other than the defaults of safety.Limits
-    memory: Memory | None = None  # of a recurrent network
+    memory: NetworkMemory | None = None  # of a recurrent network
     estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
-    motion: Motion | None = None  # that the policy follows
+    motion: FollowedMotion | None = None  # that the policy follows
     scene: str = ""  # SHA-256 of the scene's file; none in a format before 5
     terrain: str = ""  # that of the scene among steps, if there is one
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from legged_mw.deploy.contract import Contract
-from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, Source, StopFile
+from legged_mw.deploy.inputs import Gamepad, InputSource, Keys, RobotRemote, StopFile
 from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, log_path
-from legged_mw.deploy.mirror import FLAGS, LIVE, Mirror
+from legged_mw.deploy.mirror import FLAGS, LIVE, RobotMonitor
 from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
@@ -116,10 +116,10 @@ def drive(
     """
     with ExitStack() as stack:
         stack.callback(robot.close)
-        mirror = stack.enter_context(closing(Mirror(folder, contract, args))) if args.viewer in LIVE else None
+        mirror = stack.enter_context(closing(RobotMonitor(folder, contract, args))) if args.viewer in LIVE else None
         safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
         path = None if args.log == "off" else log_path(contract) if args.log is None else writable(args.log, "--log")
-        console = stack.enter_context(Console(contract))
+        console = stack.enter_context(DriveConsole(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
         checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
@@ -145,9 +145,9 @@ def drive(
         raise SystemExit(1)
 
 
-def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[Source]:
+def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[InputSource]:
     """Who may drive; the first one that does goes before the others."""
-    sources: list[Source] = [RobotRemote(contract.commands)]
+    sources: list[InputSource] = [RobotRemote(contract.commands)]
     if args.stop_fd is not None:
         sources.append(StopFile(args.stop_fd))
     if pad := _gamepad(contract, args.gamepad):
@@ -196,7 +196,7 @@ def _ended_by_signals() -> Iterator[None]:
             signal.signal(each, handler)
 
 
-class Console:
+class DriveConsole:
     """Prints lines and, in a terminal, a status below them, on a thread: a terminal that hangs delays no step."""
 
     def __init__(self, contract: Contract) -> None:
@@ -205,7 +205,7 @@ class Console:
         self._terminal, self._next = sys.stdout.isatty(), 0.0
         self._thread = threading.Thread(target=self._print, name="console", daemon=True)
 
-    def __enter__(self) -> Console:
+    def __enter__(self) -> DriveConsole:
         self._thread.start()
         return self
 

@@ -19,7 +19,7 @@ from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError, En
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill
+from legged_mw.eval.skill import ExamGround, ExamRobot, Recording, ReferenceMotion, Skill
 from legged_mw.eval.skills import make_skill
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
@@ -87,15 +87,15 @@ def contract_skill(contract: Contract) -> Skill:
 
 
 def perform(
-    folder: Path, skill: Skill, ground: Ground, threads: int = 0, edited: bool = False
-) -> tuple[Robot, Recording]:
+    folder: Path, skill: Skill, ground: ExamGround, threads: int = 0, edited: bool = False
+) -> tuple[ExamRobot, Recording]:
     """Put robots into their starts on ``ground`` and let the policy act."""
     stage = DeployStage(
         folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited
     )
     said, follower = stage.contract.motion, stage.controller.follower
-    motion = Motion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
-    robot = Robot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
+    motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
+    robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
     if starts := skill.starts(robot, skill.robots):
         stage.put(*starts)
     steps = []
@@ -111,7 +111,7 @@ def perform(
     return robot, Recording(qpos, qvel, torque, ended_at)
 
 
-def put_on(model: mujoco.MjModel, ground: Ground) -> None:
+def put_on(model: mujoco.MjModel, ground: ExamGround) -> None:
     """Change a scene: the lean of gravity, the friction of the ground, the mass of the root and its inertia in proportion."""
     if ground.slope:
         size, angle = np.linalg.norm(model.opt.gravity), math.radians(ground.slope)

@@ -14,7 +14,7 @@ from legged_mw.utils.commands import VELOCITY
 Floats = NDArray[np.floating[Any]]
 
 
-class GaitClock:
+class GaitPhase:
     """Clocks of ``count`` robots with F feet; it moves on by the contract's period with each ``keep``."""
 
     def __init__(self, contract: Contract, count: int) -> None:

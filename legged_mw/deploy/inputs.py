@@ -28,7 +28,7 @@ DEAD = 0.08  # [-] of a stick near its centre that counts as the centre
 _STICKS = dict(zip(VELOCITY, (("ly", 1.0), ("lx", -1.0), ("rx", -1.0)), strict=True))  # command -> stick, sign
 
 
-class Wish(NamedTuple):
+class DriveInput(NamedTuple):
     """What is wanted in this step."""
 
     pressed: frozenset[str] = frozenset()  # of START, WALK, END, since the last step
@@ -36,10 +36,10 @@ class Wish(NamedTuple):
     stop: str = ""  # why the robot must be damped at once
 
 
-class Source(Protocol):
+class InputSource(Protocol):
     """One who may drive."""
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         """Since the last call."""
         ...
 
@@ -71,17 +71,17 @@ class RobotRemote:
     def __init__(self, table: Sequence[Command]) -> None:
         self.table, self._held = tuple(table), frozenset[str]()
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         return self._wish(health.remote or Remote())
 
     def let_go(self) -> None: ...
 
     def close(self) -> None: ...
 
-    def _wish(self, remote: Remote) -> Wish:
+    def _wish(self, remote: Remote) -> DriveInput:
         pressed, self._held = remote.buttons - self._held, remote.buttons
         stop = f"{self.name}'s emergency stop (L2 + B)" if remote.buttons >= STOP else ""
-        return Wish(frozenset(pressed & {START, WALK, END}), from_sticks(remote, self.table), stop)
+        return DriveInput(frozenset(pressed & {START, WALK, END}), from_sticks(remote, self.table), stop)
 
 
 class Gamepad(RobotRemote):
@@ -103,13 +103,13 @@ class Gamepad(RobotRemote):
         self.path, self._sticks = path, dict[str, float]()
         self._buttons, self._lost = set[str](), False
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         pressed = frozenset[str]()
         while not self._lost and (event := self._event()):
             self._take(*event)
             pressed |= self._wish(self._remote()).pressed  # a short press may begin and end between two steps
         if self._lost:
-            return Wish(stop=f"{self.name} was unplugged")
+            return DriveInput(stop=f"{self.name} was unplugged")
         wish = self._wish(self._remote())
         return wish._replace(pressed=wish.pressed | pressed)
 
@@ -163,7 +163,7 @@ class Keys:
         if self._before is not None:
             tty.setcbreak(self._file)
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         pressed, stop = frozenset[str](), ""
         for key in self._read():
             if key == "\x1b":
@@ -173,7 +173,7 @@ class Keys:
             elif key in self._DRIVE:
                 self._pilot.press(key)
         self._pilot.listen()
-        return Wish(
+        return DriveInput(
             pressed,
             self._pilot.command if self._pilot.driving else None,
             stop or ("the terminal is gone" if self._closed else ""),
@@ -217,8 +217,8 @@ class StopFile:
             raise RobotError(f"--stop_fd {file}: {error.strerror}") from None
         self._file = file
 
-    def poll(self, health: Health) -> Wish:
-        return Wish(stop=f"file descriptor {self._file}" if select.select([self._file], [], [], 0)[0] else "")
+    def poll(self, health: Health) -> DriveInput:
+        return DriveInput(stop=f"file descriptor {self._file}" if select.select([self._file], [], [], 0)[0] else "")
 
     def let_go(self) -> None: ...
 

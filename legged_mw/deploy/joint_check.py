@@ -15,7 +15,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.inputs import END, START, Source
+from legged_mw.deploy.inputs import END, START, InputSource
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits
@@ -34,7 +34,7 @@ HEAVY = 0.4  # [share of the mass] ours: on one side of a joint from which the t
 Moves = Generator[Order, Measurement, None]
 
 
-class Row(NamedTuple):
+class JointResult(NamedTuple):
     """What one joint did."""
 
     joint: int
@@ -52,7 +52,7 @@ class JointCheck(States):
     def __init__(
         self,
         controller: Controller,
-        sources: Sequence[Source],
+        sources: Sequence[InputSource],
         say: Callable[[str], None],
         robot: Robot,
         limits: Limits,
@@ -62,7 +62,7 @@ class JointCheck(States):
             raise RobotError(
                 f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved"
             )
-        rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[Row]()
+        rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[JointResult]()
         super().__init__(controller, sources, lambda _: rest, say)
         self.joints, self._limits, self._motors, self._moves = controller.contract.joints, limits, robot.motors, None
         self._model = read_scene(controller.folder, controller.contract).model
@@ -143,7 +143,9 @@ class JointCheck(States):
             gains[joint] += (1.0 - gains[joint]) / max(1, ramp - tick)
             back = yield self._order(to, gains)
         self.rows.append(
-            Row(joint, step, moved, took, self._verdict(joint, step, moved, self._tilts(joint, before, there, back)))
+            JointResult(
+                joint, step, moved, took, self._verdict(joint, step, moved, self._tilts(joint, before, there, back))
+            )
         )
 
     def _order(self, targets: Floats, share: Floats) -> Order:

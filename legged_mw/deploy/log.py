@@ -192,7 +192,7 @@ def _or_nan(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Recording:
+class DriveLog:
     """A log that was read."""
 
     header: dict[str, Any]
@@ -201,7 +201,7 @@ class Recording:
     events: list[tuple[float, str]]
 
 
-def read_log(path: Path) -> Recording:
+def read_log(path: Path) -> DriveLog:
     """The whole log; a last block that was cut off is left out. Raises LogError."""
     try:
         first, *blocks = _blocks(path)
@@ -222,7 +222,7 @@ def read_log(path: Path) -> Recording:
         raise LogError(f"{path} is a log of format {header['format']}; this version reads {FORMAT}")
     if not rows:
         raise LogError(f"{path} holds no step: its run ended within the first {CHUNK}, or was cut off")
-    return Recording(header, files, rows, events)
+    return DriveLog(header, files, rows, events)
 
 
 def _blocks(path: Path) -> Iterator[dict[str, Any]]:

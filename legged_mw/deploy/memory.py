@@ -12,7 +12,7 @@ from legged_mw.deploy.reader import MOST_VALUES, Reader
 MEMORY = "memory"  # the contract's section, inside of `network`
 
 
-class Memory(NamedTuple):
+class NetworkMemory(NamedTuple):
     """An input and an output of the network, (batch, *shape) each: what goes out goes in at the next step, at first zeros."""
 
     input: str
@@ -27,11 +27,11 @@ class Memory(NamedTuple):
         return {**self._asdict(), "shape": list(self.shape)}
 
 
-def read_memory(section: Reader) -> Memory:
+def read_memory(section: Reader) -> NetworkMemory:
     """From the contract's reader of the section."""
     wanted = "two whole numbers from 1: states and the size of each"
     shape = section.take(
         "shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
     )
     section.take("shape", f"{MOST_VALUES} values at most", lambda v: v[0] * v[1] <= MOST_VALUES)
-    return Memory(section.text("input"), section.text("output"), tuple(shape))
+    return NetworkMemory(section.text("input"), section.text("output"), tuple(shape))

@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.inputs import Wish
+from legged_mw.deploy.inputs import DriveInput
 from legged_mw.deploy.pose import place
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.simulated import read_scene
@@ -45,7 +45,7 @@ FLAGS = ("viewer", "camera", "host", "port")
 LIVE = ("native", "web")  # of --viewer
 
 
-class Mirror:
+class RobotMonitor:
     """The end in the robot's program. It is a source of commands, too (``inputs.Source``), whose only command is to damp."""
 
     def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
@@ -105,12 +105,12 @@ class Mirror:
         with suppress(OSError):  # the viewer was closed, or is busy
             self._channel.send(json.dumps(message).encode())
 
-    def poll(self, health: Health) -> Wish:
+    def poll(self, health: Health) -> DriveInput:
         self._health = health
         try:
-            return Wish(stop="the viewer's button" if self._channel.recv(64) == DAMP else "")
+            return DriveInput(stop="the viewer's button" if self._channel.recv(64) == DAMP else "")
         except OSError:
-            return Wish()
+            return DriveInput()
 
     def let_go(self) -> None: ...
 

@@ -13,7 +13,7 @@ REFERENCE = (JOINT_POS, JOINT_VEL, PLACE, TURN)  # what the controller makes of 
 ATTITUDE, POSITION = "attitude", "position"
 
 
-class Motion(NamedTuple):
+class FollowedMotion(NamedTuple):
     """What is followed: at the anchor, and with which bodies."""
 
     anchor: str
@@ -24,8 +24,10 @@ class Motion(NamedTuple):
         return {"file": MOTION_FILE, "sha256": self.digest, "anchor": self.anchor, "bodies": list(self.bodies)}
 
 
-def read_motion(section: Reader) -> Motion:
+def read_motion(section: Reader) -> FollowedMotion:
     """From the contract's reader of the section."""
     bodies = section.texts("bodies")
     section.file("file", MOTION_FILE)
-    return Motion(section.take("anchor", "one of `bodies`", lambda v: v in bodies), bodies, section.text("sha256"))
+    return FollowedMotion(
+        section.take("anchor", "one of `bodies`", lambda v: v in bodies), bodies, section.text("sha256")
+    )

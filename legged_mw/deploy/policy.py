@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from legged_mw.deploy.contract import CLOCK, CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
 from legged_mw.deploy.estimate import ESTIMATE, columns_of
 from legged_mw.deploy.follow import Follower
-from legged_mw.deploy.gait import GaitClock
+from legged_mw.deploy.gait import GaitPhase
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
 
@@ -125,7 +125,7 @@ class Controller:
         # as last observed
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]
         self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
-        self.clock = GaitClock(contract, count) if contract.gait else None
+        self.clock = GaitPhase(contract, count) if contract.gait else None
         self.follower = Follower(folder, contract, count) if contract.motion else None
         self.memory = contract.memory.start(count) if contract.memory else None  # (N, *shape)
 

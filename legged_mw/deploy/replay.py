@@ -19,7 +19,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.estimate import ESTIMATE, columns_of
-from legged_mw.deploy.log import LogError, Recording, read_log
+from legged_mw.deploy.log import DriveLog, LogError, read_log
 from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.pose import place
@@ -42,7 +42,7 @@ class Replay(NamedTuple):
     """The longest walk of a log, and the simulation of it; both have T rows, or the simulation fewer if it fell."""
 
     contract: Contract
-    recording: Recording
+    recording: DriveLog
     robot: Rows
     simulated: Rows
 
@@ -61,7 +61,7 @@ def replay(path: Path, folder: Path | None = None, edited: bool = False) -> Repl
         )
 
 
-def _replay(path: Path, recording: Recording, folder: Path, edited: bool) -> Replay:
+def _replay(path: Path, recording: DriveLog, folder: Path, edited: bool) -> Replay:
     contract = read_contract(folder, edited)
     if contract.digest != recording.header["network"]:
         raise LogError(

@@ -278,7 +278,7 @@ def _keep_quiet() -> None:
 
 
 @dataclass(frozen=True)
-class Scene:
+class DeployScene:
     """The robot in MuJoCo, and where its names are."""
 
     spec: mujoco.MjSpec
@@ -289,7 +289,7 @@ class Scene:
     contacts: list[np.ndarray]  # the same of each foot
 
 
-def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> Scene:
+def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> DeployScene:
     """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError.
 
     ``whole``: every body with collision shapes (group 3) touches the ground, and the solver is one for a robot that lies there.
@@ -332,7 +332,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
     _check_order(model, contract)
     _check_machine(model, file, contract, joints, actuators)
-    return Scene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
+    return DeployScene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
 
 
 def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

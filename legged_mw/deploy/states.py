@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legged_mw.deploy.inputs import END, START, WALK, Source
+from legged_mw.deploy.inputs import END, START, WALK, InputSource
 from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
@@ -108,7 +108,7 @@ class States:
     def __init__(
         self,
         controller: Controller,
-        sources: Sequence[Source],
+        sources: Sequence[InputSource],
         command: Callable[[float], Floats],
         say: Callable[[str], None] = print,
     ) -> None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
+from legged_mw.eval.skill import ExamGround, ExamRobot, Floats, Measure, Recording, Skill
 from legged_mw.skills.clip import rotate
 from legged_mw.skills.drop_states import fallen
 
@@ -19,7 +19,7 @@ AT_LIMIT = 0.98  # share of the force limit from which a torque is at it
 
 
 @dataclass(frozen=True)
-class Getup(Skill):
+class GetupExam(Skill):
     """256 falls on each ground."""
 
     within: float = 3.0  # [s] in which it must stand
@@ -27,10 +27,10 @@ class Getup(Skill):
     kind = "getup"
     asks = "256 falls on each ground: it stands high, upright and with joints at rest in time, and 5 s later still does"
     grounds: ClassVar = {
-        "plane": Ground(),
-        "slope": Ground(slope=10.0),
-        "slippery": Ground(friction=0.3),
-        "loaded": Ground(load=2.0),
+        "plane": ExamGround(),
+        "slope": ExamGround(slope=10.0),
+        "slippery": ExamGround(friction=0.3),
+        "loaded": ExamGround(load=2.0),
     }
     robots = 256
     measures = (
@@ -47,10 +47,10 @@ class Getup(Skill):
     def seconds(self) -> float:
         return self.within + STAY + HOLD
 
-    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats]:
+    def starts(self, robot: ExamRobot, count: int) -> tuple[Floats, Floats]:
         return fallen(robot.model, count, SEED, SETTLING)
 
-    def judge(self, robot: Robot, recording: Recording) -> dict[str, float | None]:
+    def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         hold, stay, limit = (round(seconds / robot.dt) for seconds in (HOLD, STAY, self.within))
         held = _lasting(standing(robot, recording), hold)  # (T - hold + 1, N) it stands, for HOLD from here on
         up_at = np.where(held.any(axis=0), held.argmax(axis=0), len(held))  # (N,) first step, or never
@@ -72,7 +72,7 @@ class Getup(Skill):
         }
 
 
-def standing(robot: Robot, recording: Recording) -> np.ndarray:
+def standing(robot: ExamRobot, recording: Recording) -> np.ndarray:
     """(T, N) High, upright and with joints at rest; where an episode ended, no more."""
     axis = rotate(recording.qpos[..., 3:7], np.array([0.0, 0.0, 1.0]))  # the root's z, in the world
     gravity = robot.model.opt.gravity / np.linalg.norm(robot.model.opt.gravity)

@@ -10,7 +10,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
+from legged_mw.eval.skill import ExamGround, ExamRobot, Floats, Measure, Recording, Skill
 from legged_mw.skills.clip import rotate
 
 SEED, OFFSET = 30_000, 0.05  # of the starts; each joint is off by U(-OFFSET, OFFSET) [rad] [ours]
@@ -19,7 +19,7 @@ TILT, HIGH = 30.0, 0.8  # [deg] between the root's x axis and the vertical, shar
 
 
 @dataclass(frozen=True)
-class Handstand(Skill):
+class HandstandExam(Skill):
     """64 tries on each ground."""
 
     nose: float = -1.0  # -1 down, 1 up
@@ -28,7 +28,7 @@ class Handstand(Skill):
 
     kind = "handstand"
     asks = "64 tries from standing on each ground: within 3 s it is up for 5 s, and nothing but the hands touches the ground"
-    grounds: ClassVar = {"plane": Ground(), "slippery": Ground(friction=0.4), "loaded": Ground(load=1.0)}
+    grounds: ClassVar = {"plane": ExamGround(), "slippery": ExamGround(friction=0.4), "loaded": ExamGround(load=1.0)}
     robots = 64
     measures = (
         Measure("holds", "share that holds for 5 s", 3, (0.95, 0.9)),
@@ -42,12 +42,12 @@ class Handstand(Skill):
     def seconds(self) -> float:
         return WITHIN + HOLD
 
-    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats]:
+    def starts(self, robot: ExamRobot, count: int) -> tuple[Floats, Floats]:
         qpos = np.tile(robot.home, (count, 1))
         qpos[:, 7:] += np.random.default_rng(SEED).uniform(-OFFSET, OFFSET, (count, robot.model.nq - 7))
         return qpos, np.zeros((count, robot.model.nv))
 
-    def judge(self, robot: Robot, recording: Recording) -> dict[str, float | None]:
+    def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         touching, hands = self._ground_contact(robot, recording.qpos)
         ahead = rotate(recording.qpos[..., 3:7], np.array([1.0, 0.0, 0.0]))  # the root's x axis, in the world
         upright = self.nose * ahead[..., 2] > np.cos(np.radians(TILT))
@@ -69,7 +69,7 @@ class Handstand(Skill):
             "worst": int(np.argmax(np.where(holds, drift, np.inf))),
         }
 
-    def _ground_contact(self, robot: Robot, qpos: Floats) -> tuple[np.ndarray, np.ndarray]:
+    def _ground_contact(self, robot: ExamRobot, qpos: Floats) -> tuple[np.ndarray, np.ndarray]:
         """(T, N) whether anything but the hands touches the ground, and (T, N, 2) the middle of the hands [m]."""
         model, data = robot.model, mujoco.MjData(robot.model)
         free = np.array([model.geom(name).id for name in self.hands])

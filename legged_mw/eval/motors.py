@@ -20,7 +20,7 @@ NEAR = 0.02  # of the highest torque: so near to the envelope counts as at it
 MARGIN = 1.08  # of what is drawn around samples and envelope
 
 
-class Limits(NamedTuple):
+class MotorLimits(NamedTuple):
     """What motors can do, (D,) each; infinite where nothing is known."""
 
     low: Array  # [N m]
@@ -35,12 +35,12 @@ class Limits(NamedTuple):
             self.high, self.stall_torque * (1.0 - share)
         )
 
-    def of(self, joint: int) -> Limits:
+    def of(self, joint: int) -> MotorLimits:
         """Of one joint, (1,) each."""
-        return Limits(*(values[joint : joint + 1] for values in self))
+        return MotorLimits(*(values[joint : joint + 1] for values in self))
 
 
-def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: Limits) -> list[dict[str, Any]]:
+def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorLimits) -> list[dict[str, Any]]:
     """Of each kind of joint how often which torque came at which speed, where its motor ends, and the share of time that it is there.
 
     ``kinds`` (D,): joints of one kind share a picture; their motors are alike. Worlds that fell do not count.
@@ -63,7 +63,7 @@ def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: Limits
     return found
 
 
-def _picture(torque: Array, speed: Array, limits: Limits) -> dict[str, Any]:
+def _picture(torque: Array, speed: Array, limits: MotorLimits) -> dict[str, Any]:
     """Counts of samples on a grid, and the envelope over its speeds."""
     free = float(limits.no_load_speed[0])
     widest = max(float(np.abs(speed).max(initial=1.0)), min(free, 1e3) if np.isfinite(free) else 0.0) * MARGIN

@@ -17,7 +17,7 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, skill_page
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill, Starts
+from legged_mw.eval.skill import ExamGround, ExamRobot, Recording, ReferenceMotion, Skill, Starts
 from legged_mw.eval.skills import make_skill
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
@@ -86,7 +86,7 @@ def _draw(env: RobotTask, strips: Mapping[str, np.ndarray]) -> dict[str, bytes]:
         return {}
 
 
-def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
+def on_ground(env: RobotTask, ground: ExamGround) -> RobotTask:
     """Another environment of the same task, on ``ground``."""
     changes = {"terrain.slope": ground.slope} if ground.slope else {}
     changes |= {"terrain.friction": ground.friction} if ground.friction is not None else {}
@@ -101,22 +101,22 @@ def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
     return type(env)(cfg, env.device, eager=env.eager)
 
 
-def machine(env: RobotTask) -> Robot:
+def machine(env: RobotTask) -> ExamRobot:
     """What the exam knows of the robot."""
     home = np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose])
-    return Robot(env.robot.physics, home, env.dt, motion_of(env) if isinstance(env, MotionTracking) else None)
+    return ExamRobot(env.robot.physics, home, env.dt, motion_of(env) if isinstance(env, MotionTracking) else None)
 
 
-def motion_of(env: MotionTracking) -> Motion:
+def motion_of(env: MotionTracking) -> ReferenceMotion:
     """The first clip."""
-    return Motion(env.clips[0].qpos(), tuple(env.cfg.motion.bodies), env.cfg.motion.anchor)
+    return ReferenceMotion(env.clips[0].qpos(), tuple(env.cfg.motion.bodies), env.cfg.motion.anchor)
 
 
 def perform(
     env: RobotTask,
     policy: Policy,
     skill: Skill,
-    ground: Ground = Ground(),  # noqa: B008
+    ground: ExamGround = ExamGround(),  # noqa: B008
     starts: Starts | None = None,
 ) -> Recording:
     """Put the robots of all worlds into their starts, or into ``starts`` where they are known, and let ``policy`` act."""

@@ -80,7 +80,7 @@ HEAT = "viridis"  # perceptually uniform
 GAITS = (1, 2, 3, 5, 7, 11)  # of the 22 commands, that are drawn: ahead, at three speeds; back; left; turning left
 
 
-class Panel(NamedTuple):
+class PlotPanel(NamedTuple):
     """One pair of axes."""
 
     draw: Callable[[Any], None]
@@ -94,20 +94,22 @@ class Section(NamedTuple):
 
     name: str
     title: str
-    panels: list[Panel]
+    panels: list[PlotPanel]
     across: int = 3  # panels side by side
 
 
 def sections(columns: Columns, rules: ExamRules) -> list[Section]:
     """All that is drawn of one policy or two, with the marks and the peer of the first one's rules."""
-    pushes = [Panel(partial(_push_curve, columns, rules), height=2.9)]
+    pushes = [PlotPanel(partial(_push_curve, columns, rules), height=2.9)]
     for which in ("walking", "standing"):
         for i, (name, figures) in enumerate(columns):
             title = f"{which}{_of(name, columns)}"
-            pushes.append(Panel(partial(_push_wheel, figures["pushes"], which, PAIR[i], title), height=2.9, polar=True))
-    responses = [Panel(partial(_response, columns, i)) for i in range(3)]
-    strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in GAITS]
-    energy = [Panel(partial(_against_speed, columns, rules, key)) for key in ("power", "cost_of_transport")]
+            pushes.append(
+                PlotPanel(partial(_push_wheel, figures["pushes"], which, PAIR[i], title), height=2.9, polar=True)
+            )
+    responses = [PlotPanel(partial(_response, columns, i)) for i in range(3)]
+    strides = [PlotPanel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in GAITS]
+    energy = [PlotPanel(partial(_against_speed, columns, rules, key)) for key in ("power", "cost_of_transport")]
     terms = len(columns[0][1]["reward"])
     rough, believed = _crossing_maps(columns), _estimates(columns)
     return [
@@ -120,7 +122,9 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
         *([Section("motors", "Torque against speed", motors)] if (motors := _motor_panels(columns)) else []),
         Section("pushes", "Pushes", pushes),
         Section("energy", "Energy", energy, across=2),
-        Section("reward", "Reward", [Panel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1),
+        Section(
+            "reward", "Reward", [PlotPanel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1
+        ),
     ]
 
 
@@ -177,12 +181,12 @@ def _array(values: Any) -> np.ndarray:
 # ---- rough ground
 
 
-def _crossing_maps(columns: Columns) -> list[Panel]:
+def _crossing_maps(columns: Columns) -> list[PlotPanel]:
     """A map a policy that was graded on rough ground."""
     graded = [(_of(name, columns), figures["crossing"]) for name, figures in columns if "crossing" in figures]
     kinds = max((len(result["kinds"]) for _, result in graded), default=0)
     width, height = 6.2 if len(graded) == 1 else 5.2, 0.75 + 0.43 * kinds
-    return [Panel(partial(_crossing, result["kinds"], suffix), width, height) for suffix, result in graded]
+    return [PlotPanel(partial(_crossing, result["kinds"], suffix), width, height) for suffix, result in graded]
 
 
 def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
@@ -220,7 +224,7 @@ def _percent(share: float) -> str:
 # ---- following the command
 
 
-def _heat_maps(columns: Columns, rules: ExamRules) -> list[Panel]:
+def _heat_maps(columns: Columns, rules: ExamRules) -> list[PlotPanel]:
     """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark.
 
     Where the marks are of offsets, an error has none: its scale has no stroke, and may be longer.
@@ -236,7 +240,7 @@ def _heat_maps(columns: Columns, rules: ExamRules) -> list[Panel]:
                 top = max(1.25 * mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
                 stroke = mark if strict else None
                 panels.append(
-                    Panel(
+                    PlotPanel(
                         partial(_heat, figures["tracking"], grid, across, k, stroke, top, _of(name, columns)),
                         height=2.45,
                     )
@@ -308,13 +312,13 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         ax.legend(loc="lower right", handlelength=1.6)
 
 
-def _estimates(columns: Columns) -> list[Panel]:
+def _estimates(columns: Columns) -> list[PlotPanel]:
     """A panel an axis of each policy that estimates its velocity."""
     panels = []
     for i, (name, figures) in enumerate(columns):
         for k in range(2 if "estimate" in figures else 0):
             draw = partial(estimate_panel.draw, figures["estimate"], k, (INK, PAIR[i], FAINT), _of(name, columns))
-            panels.append(Panel(draw, estimate_panel.WIDTH, estimate_panel.HEIGHT))
+            panels.append(PlotPanel(draw, estimate_panel.WIDTH, estimate_panel.HEIGHT))
     return panels
 
 
@@ -345,10 +349,10 @@ def _gait(columns: Columns, world: int, ax: Axes) -> None:
 # ---- joints
 
 
-def _joint_panels(columns: Columns) -> list[Panel]:
+def _joint_panels(columns: Columns) -> list[PlotPanel]:
     height = 0.9 + 0.29 * len(columns[0][1]["joint_names"])
     quantities = (("dof_pos", "position [rad]"), ("dof_vel", "velocity [rad/s]"), ("torque", "torque [N m]"))
-    return [Panel(partial(_joints, columns, key, label), height=height) for key, label in quantities]
+    return [PlotPanel(partial(_joints, columns, key, label), height=height) for key, label in quantities]
 
 
 def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
@@ -376,13 +380,13 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     ax.margins(x=0.04)
 
 
-def _motor_panels(columns: Columns) -> list[Panel]:
+def _motor_panels(columns: Columns) -> list[PlotPanel]:
     """A picture a kind of joint and policy; figures that were saved before there were any have none."""
     rows = zip_longest(
         *([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns)
     )
     return [
-        Panel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix))
+        PlotPanel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix))
         for row in rows
         for suffix, motor in filter(None, row)
     ]

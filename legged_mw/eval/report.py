@@ -113,10 +113,10 @@ def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]
     return {"dof_pos": (position[0], position[1]), "dof_vel": (-speeds, speeds), "torque": (effort[0], effort[1])}
 
 
-def motor_limits(env: LeggedRobot) -> motors.Limits:
+def motor_limits(env: LeggedRobot) -> motors.MotorLimits:
     """Force limits and torque-speed curves; what is not known is infinite."""
     curve = (np.array(env.robot.tables.get(name, [np.inf] * env.num_actions)) for name in CURVE)
-    return motors.Limits(*env.robot.effort_range.T, *curve)
+    return motors.MotorLimits(*env.robot.effort_range.T, *curve)
 
 
 def write(

@@ -25,7 +25,7 @@ PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] directions th
 Starts = tuple[Floats, Floats]  # qpos (N, nq), qvel (N, nv)
 
 
-class Ground(NamedTuple):
+class ExamGround(NamedTuple):
     """What is another than in the task as it was trained, without randomization."""
 
     slope: float = 0.0  # [deg] of the plane; in simulation gravity leans and the plane stays
@@ -43,7 +43,7 @@ class Ground(NamedTuple):
         return self.push * now[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-class Motion(NamedTuple):
+class ReferenceMotion(NamedTuple):
     """What a robot is to follow."""
 
     qpos: Floats  # (T, nq) a frame a control step
@@ -51,13 +51,13 @@ class Motion(NamedTuple):
     anchor: str  # one of them, at which they are
 
 
-class Robot(NamedTuple):
+class ExamRobot(NamedTuple):
     """The machine that an exam is about."""
 
     model: mujoco.MjModel  # as it is stepped, with the gravity of the exam's ground
     home: Floats  # (nq,) where an episode starts, joints in their default pose
     dt: float  # [s] a control step
-    motion: Motion | None = None
+    motion: ReferenceMotion | None = None
 
 
 class Recording(NamedTuple):
@@ -85,7 +85,7 @@ class Skill(ABC):
 
     kind: ClassVar[str]
     asks: ClassVar[str]  # one sentence for the table
-    grounds: ClassVar[Mapping[str, Ground]]  # parts of the exam; the first is also the exam during training
+    grounds: ClassVar[Mapping[str, ExamGround]]  # parts of the exam; the first is also the exam during training
     robots: ClassVar[int]  # of each part
     measures: ClassVar[Sequence[Measure]]
     overrides: ClassVar[Mapping[str, Any]] = {}  # config fields, beside those that every exam sets (exam.OVERRIDES)
@@ -95,16 +95,16 @@ class Skill(ABC):
     def seconds(self) -> float:
         """How long robots are watched [s]."""
 
-    def steps(self, robot: Robot) -> int:
+    def steps(self, robot: ExamRobot) -> int:
         """How long [control steps]."""
         return round(self.seconds / robot.dt)
 
     @abstractmethod
-    def starts(self, robot: Robot, count: int) -> Starts | None:
+    def starts(self, robot: ExamRobot, count: int) -> Starts | None:
         """qpos (count, nq) and qvel (count, nv) to begin with, the same at every call; None: where the task's episodes begin."""
 
     @abstractmethod
-    def judge(self, robot: Robot, recording: Recording) -> dict[str, float | None]:
+    def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         """A value for each of ``measures``; None where there is nothing to measure. Other keys are kept too."""
 
     def result(self, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

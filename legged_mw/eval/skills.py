@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from legged_mw.eval.getup import Getup
-from legged_mw.eval.handstand import Handstand
+from legged_mw.eval.getup import GetupExam
+from legged_mw.eval.handstand import HandstandExam
 from legged_mw.eval.skill import Skill
-from legged_mw.eval.tracking import Tracking
+from legged_mw.eval.tracking import TrackingExam
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-SKILLS: dict[str, type[Skill]] = {kind.kind: kind for kind in (Getup, Handstand, Tracking)}
+SKILLS: dict[str, type[Skill]] = {kind.kind: kind for kind in (GetupExam, HandstandExam, TrackingExam)}
 
 
 def make_skill(kind: str, section: Mapping[str, Any]) -> Skill:

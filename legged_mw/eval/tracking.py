@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
+from legged_mw.eval.skill import ExamGround, ExamRobot, Floats, Measure, Recording, Skill
 from legged_mw.skills.clip import conjugate, from_rotation_vector, heading, multiply, rotate
 
 JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1  # [rad], [rad], [m/s] of a robot at the start, U(-off, off)
@@ -19,12 +19,12 @@ FAR = 1e9  # of the task's own rules, which the exam does not use: the exports k
 
 
 @dataclass(frozen=True)
-class Tracking(Skill):
+class TrackingExam(Skill):
     """Does it follow the clip to its end, and how closely?"""
 
     kind = "tracking"
     asks = "The whole clip from its start, by 32 robots that begin a little off it; pushed ones get 0.5 m/s every 2 s."
-    grounds = {"not pushed": Ground(), "pushed": Ground(push=0.5)}
+    grounds = {"not pushed": ExamGround(), "pushed": ExamGround(push=0.5)}
     robots = 32
     measures = (
         Measure("finished", "share that finishes", 2, (1.0, 0.9)),
@@ -41,11 +41,11 @@ class Tracking(Skill):
     def seconds(self) -> float:
         return 0.0  # it is the clip that says: see `steps`
 
-    def steps(self, robot: Robot) -> int:
+    def steps(self, robot: ExamRobot) -> int:
         assert robot.motion
         return len(robot.motion.qpos)
 
-    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats]:
+    def starts(self, robot: ExamRobot, count: int) -> tuple[Floats, Floats]:
         assert robot.motion
         rng, first = np.random.default_rng(0), robot.motion.qpos[0]
         qpos, qvel = np.tile(first, (count, 1)), np.zeros((count, robot.model.nv))
@@ -55,7 +55,7 @@ class Tracking(Skill):
         qvel[:, :2] = rng.uniform(-SPEED_OFF, SPEED_OFF, (count, 2))
         return qpos, qvel
 
-    def judge(self, robot: Robot, recording: Recording) -> dict[str, float | None]:
+    def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         assert robot.motion
         motion, model, steps = robot.motion, robot.model, len(recording.qpos)
         bodies, anchor = [model.body(name).id for name in motion.bodies], motion.bodies.index(motion.anchor)

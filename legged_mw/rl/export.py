@@ -37,8 +37,8 @@ from legged_mw.deploy.contract import (
     read_contract,
 )
 from legged_mw.deploy.estimate import Estimated
-from legged_mw.deploy.memory import Memory
-from legged_mw.deploy.motion import MOTION_FILE, Motion
+from legged_mw.deploy.memory import NetworkMemory
+from legged_mw.deploy.motion import MOTION_FILE, FollowedMotion
 from legged_mw.deploy.motors import MOTORS_FILE, Motors
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
@@ -141,7 +141,7 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
     with _all_or_nothing(folder) as new:
         save_yaml(new / CONFIG_FILE, config)
         _write_network(policy, clip, new / NETWORK_FILE, half)
-        memory = Memory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
+        memory = NetworkMemory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
         contract = dataclasses.replace(make_contract(env, task, new, noise), memory=memory)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         contract = dataclasses.replace(
@@ -352,12 +352,12 @@ def _motors(env: RobotTask, folder: Path) -> Motors:
     )
 
 
-def _motion(env: RobotTask, folder: Path) -> Motion | None:
+def _motion(env: RobotTask, folder: Path) -> FollowedMotion | None:
     """What the policy follows, whose frames are written to ``folder``."""
     if not isinstance(env, MotionTracking):
         return None
     save_clip(folder / MOTION_FILE, env.clips[0])
-    return Motion(env.cfg.motion.anchor, tuple(env.cfg.motion.bodies), digest(folder / MOTION_FILE))
+    return FollowedMotion(env.cfg.motion.anchor, tuple(env.cfg.motion.bodies), digest(folder / MOTION_FILE))
 
 
 def _ends(env: RobotTask) -> Ends:

@@ -106,7 +106,7 @@ class Stand(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Health:
+class RobotNumbers:
     """All numbers of the page."""
 
     mass: float  # [kg]
@@ -124,7 +124,7 @@ class Health:
 
 def measure(
     robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5, rough: bool = False
-) -> Health:
+) -> RobotNumbers:
     """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
 
     Room is counted for ``rough`` ground, if so.
@@ -133,7 +133,7 @@ def measure(
     rest = stand_as_statue(robot, angles, np.array(place, dtype=float))
     matrices = mass_matrices(robot, angles)
     implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    return Health(
+    return RobotNumbers(
         mass=float(model.body_subtreemass[0]),
         height=float(rest.qpos[2]),
         top=_highest(robot, rest.qpos),

@@ -11,7 +11,7 @@ import torch
 from legged_mw.check.guard import nothing_changed, tiny_cfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.ranks import this_rank
-from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Health, Joint, Stand, measure
+from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Joint, RobotNumbers, Stand, measure
 from legged_mw.robot.suggest import Gains, suggest
 from legged_mw.utils.errors import in_short, place_of
 from legged_mw.utils.task import LoadedTask
@@ -35,7 +35,7 @@ _HEAD = (
 )
 
 
-def page(health: Health, title: str, guessed: Sequence[str] = (), changed: Sequence[str] = ()) -> str:
+def page(health: RobotNumbers, title: str, guessed: Sequence[str] = (), changed: Sequence[str] = ()) -> str:
     """Everything, as lines; ``guessed`` are lines on what nobody said and was taken, ``changed`` on what of the file is not as written."""
     gains = suggest(health.joints, health.dt)
     lines = [f"health of {title}", *(f"  guessed: {line}" for line in guessed), *_summary(health)]
@@ -56,7 +56,7 @@ _LEGEND = (
 )
 
 
-def _summary(health: Health) -> list[str]:
+def _summary(health: RobotNumbers) -> list[str]:
     rest, integrator = health.rest, "implicitfast" if health.implicit else "euler"
     upright = " (it topples; these are with its root held upright)" if rest.toppled else ""
     over = (
@@ -87,13 +87,13 @@ def standing(stand: Stand) -> str:
     return f"{what[stand.end]} after {stand.seconds:.2f} s"
 
 
-def _mode(health: Health) -> str:
+def _mode(health: RobotNumbers) -> str:
     if health.mode.growth <= 1.0 + _GROWS:
         return "stable"
     return f"UNSTABLE, a mode of {', '.join(health.mode.joints)} grows {health.mode.growth:.2f}-fold a substep"
 
 
-def _table(health: Health, gains: Sequence[Gains]) -> list[str]:
+def _table(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
     rows = [_HEAD, *(_row(joint, gain, health) for joint, gain in zip(health.joints, gains, strict=True))]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
     return [
@@ -106,7 +106,7 @@ def _table(health: Health, gains: Sequence[Gains]) -> list[str]:
     ]
 
 
-def _row(joint: Joint, gain: Gains, health: Health) -> tuple[str, ...]:
+def _row(joint: Joint, gain: Gains, health: RobotNumbers) -> tuple[str, ...]:
     verdict = joint.verdict(health.dt, health.implicit)
     mark = {"": "", "rings": "!", "unstable": "!!"}[verdict]
     return (
@@ -126,7 +126,7 @@ def _those(which: Sequence[Joint]) -> str:
     return ", ".join(joint.name for joint in which)
 
 
-def faults(health: Health) -> list[str]:
+def faults(health: RobotNumbers) -> list[str]:
     """What should be looked at, a line each: what is wrong, where, and the field that mends it. Here what no training makes up for."""
     dt, joints, lines = health.dt, health.joints, []
     if bad := [joint for joint in joints if joint.verdict(dt, health.implicit) == "unstable"]:
@@ -149,7 +149,7 @@ def faults(health: Health) -> list[str]:
     return lines
 
 
-def doubtful(health: Health, gains: Sequence[Gains]) -> list[str]:
+def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
     """Likewise what some robots live with."""
     dt, joints, lines = health.dt, health.joints, []
     if rings := [joint for joint in joints if joint.verdict(dt, health.implicit) == "rings"]:

@@ -45,7 +45,7 @@ class Faults:
     voltage: float | None = None  # [V]; None: of a full battery
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """A fault by its name on the command line."""
 
     field: str  # of Faults
@@ -63,24 +63,24 @@ NAN = {
 }
 SWAPS = {"xy": [1, 0, 2], "xz": [2, 1, 0], "yz": [0, 2, 1]}
 KINDS = {
-    "delay": Kind("delay_ms", 200.0, 0, 1000, "ms"),
-    "jitter": Kind("jitter_ms", 20.0, 0, 1000, "ms"),
-    "loss": Kind("loss", 100.0, 0, 100, "%"),
-    **{name: Kind(name, True) for name in ("bad_crc", "frozen", "silent", "no_remote")},
-    "clock_jump": Kind("clock_jump", -1.0, -1000, 1000, "s"),
-    "mode_machine": Kind("mode_machine", 4, 0, 255),
-    "joint_order": Kind("joint_order", 1, -40, 40, "places"),
-    "joint_sign": Kind("turned_joints", None),
-    "motor_fault": Kind("dead_motors", None),
-    "stuck": Kind("stuck", None),
-    "joint_bias": Kind("joint_bias", 2.0, unit="rad"),
-    "joint_speed": Kind("joint_speed", 100.0, unit="rad/s"),
-    "gyro_bias": Kind("gyro_bias", 0.5, unit="rad/s"),
-    "imu_tilt": Kind("imu_tilt", 180.0, unit="deg"),
-    "imu_swap": Kind("imu_swap", "xz"),
-    "nan": Kind("nan", "q"),
-    "hot_motor": Kind("temperature", 95.0, 0, 127, "deg C"),
-    "low_battery": Kind("voltage", 20.0, 0, unit="V"),
+    "delay": FaultKind("delay_ms", 200.0, 0, 1000, "ms"),
+    "jitter": FaultKind("jitter_ms", 20.0, 0, 1000, "ms"),
+    "loss": FaultKind("loss", 100.0, 0, 100, "%"),
+    **{name: FaultKind(name, True) for name in ("bad_crc", "frozen", "silent", "no_remote")},
+    "clock_jump": FaultKind("clock_jump", -1.0, -1000, 1000, "s"),
+    "mode_machine": FaultKind("mode_machine", 4, 0, 255),
+    "joint_order": FaultKind("joint_order", 1, -40, 40, "places"),
+    "joint_sign": FaultKind("turned_joints", None),
+    "motor_fault": FaultKind("dead_motors", None),
+    "stuck": FaultKind("stuck", None),
+    "joint_bias": FaultKind("joint_bias", 2.0, unit="rad"),
+    "joint_speed": FaultKind("joint_speed", 100.0, unit="rad/s"),
+    "gyro_bias": FaultKind("gyro_bias", 0.5, unit="rad/s"),
+    "imu_tilt": FaultKind("imu_tilt", 180.0, unit="deg"),
+    "imu_swap": FaultKind("imu_swap", "xz"),
+    "nan": FaultKind("nan", "q"),
+    "hot_motor": FaultKind("temperature", 95.0, 0, 127, "deg C"),
+    "low_battery": FaultKind("voltage", 20.0, 0, unit="V"),
 }
 
 
@@ -121,7 +121,7 @@ def _parse(text: str, joints: Sequence[str]) -> Fault:
     )
 
 
-def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], where: str) -> Any:
+def _value(name: str, kind: FaultKind, value: str | None, joints: Sequence[str], where: str) -> Any:
     words = {"nan": NAN, "imu_swap": SWAPS}
     known = words.get(name, [*joints, *NAN] if name == "stuck" else joints if kind.value is None else None)
     if known is not None and value is not None:

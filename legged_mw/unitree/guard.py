@@ -234,7 +234,7 @@ class Guarded:
         return True
 
     def _damp_instead(self, why: str) -> None:
-        """From now on this process sends what it armed the guard with: damping. A guard that goes on damps, too (see ``Guard.turn``)."""
+        """From now on this process sends damping. A guard that still runs damps as well: see ``WireGuard.turn``."""
         if self._damping and not self._instead:
             self._instead = f"{why}; {INSTEAD}"
             self._commander.send(self._damping)
@@ -259,7 +259,7 @@ class Guarded:
 # ---- the guard's side ----------------------------------------------------------------------------------------------
 
 
-class Guard:
+class WireGuard:
     """The loop of the guard's process."""
 
     def __init__(
@@ -414,7 +414,7 @@ def main() -> None:
         return
     board = Board(settings["board"], len(first.body))
     board.put(first.stamp, first.body, first.stamp)
-    guard = Guard(wire, channel, board, settings["package"], settings["late"], still=settings["still"])
+    guard = WireGuard(wire, channel, board, settings["package"], settings["late"], still=settings["still"])
     for number in signal.valid_signals() - KEPT:
         signal.signal(number, guard.stop)
     guard.tell({"ready": True})

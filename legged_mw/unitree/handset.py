@@ -38,7 +38,7 @@ PRESSED = {"1": ("start",), "2": ("A",), "x": ("select",), "!": ("L2", "B")}
 KEYS_HELP = "keys: 1 start, 2 A (policy), x select (damping), ! L2+B (stop), w s a d q e sticks, space centres them, h hoist, r remote off"
 
 
-class Entry(NamedTuple):
+class RemoteEvent(NamedTuple):
     """What happens at a time."""
 
     time: float  # [s]
@@ -47,7 +47,7 @@ class Entry(NamedTuple):
     hoist: bool | None = None
 
 
-def load_remote(path: Path) -> list[Entry]:
+def load_remote(path: Path) -> list[RemoteEvent]:
     """The entries of a script, in the order of their times. Raises ConfigError."""
     listed = load_yaml(path).get("remote")
     if not isinstance(listed, list) or not listed:
@@ -55,7 +55,7 @@ def load_remote(path: Path) -> list[Entry]:
     return sorted((_entry(each, f"{path}: remote[{i}]") for i, each in enumerate(listed)), key=lambda entry: entry.time)
 
 
-def _entry(values: Any, where: str) -> Entry:
+def _entry(values: Any, where: str) -> RemoteEvent:
     if not isinstance(values, dict) or not _number(values.get("time")) or values["time"] < 0:
         raise ConfigError(f"{where}: an entry is a mapping with a time [s] from 0, not {values!r}")
     for name in values:
@@ -70,7 +70,7 @@ def _entry(values: Any, where: str) -> Entry:
             raise ConfigError(f"{where}: {name} is {value!r}; a stick is a number from -1 to 1")
     if not isinstance(values.get("hoist", False), bool):
         raise ConfigError(f"{where}: hoist is {values['hoist']!r}; it is true or false")
-    return Entry(
+    return RemoteEvent(
         float(values["time"]), tuple(press) if isinstance(press, list) else (press,), sticks, values.get("hoist")
     )
 
@@ -82,7 +82,7 @@ def _number(value: object) -> bool:
 class Handset:
     """The remote as it is held now."""
 
-    def __init__(self, script: Sequence[Entry] = (), keys: bool = False) -> None:
+    def __init__(self, script: Sequence[RemoteEvent] = (), keys: bool = False) -> None:
         """``keys``: read this terminal, which must be one."""
         self._script, self._next = list(script), 0
         self._sticks: dict[str, float] = dict.fromkeys(STICKS, 0.0)

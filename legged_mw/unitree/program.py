@@ -17,7 +17,7 @@ from legged_mw.unitree import need_dds
 from legged_mw.unitree.faults import Fault
 from legged_mw.unitree.handset import Handset
 from legged_mw.unitree.robots import machine_of
-from legged_mw.unitree.serve import STEP, Record, SimulatedUnitree
+from legged_mw.unitree.serve import STEP, ServedRecord, SimulatedUnitree
 
 BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
 PRIORITY = 10  # ours, of a real-time process: below those of a policy
@@ -33,7 +33,7 @@ class Served:
     upright: float  # cosine of its largest tilt while its servos were on
     latencies: list[float]  # [s] from a state that it sent to the first command that answers it
     place: tuple[float, float, float]  # [m] of the root at the end
-    record: Record
+    record: ServedRecord
     faults: Sequence[Fault]  # that have begun
 
     def text(self) -> str:

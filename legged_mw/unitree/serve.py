@@ -46,7 +46,7 @@ LIMP, DAMPED, DRIVEN = "limp", "damped", "driven"  # what motors do: nothing, da
 
 
 @dataclass
-class Record:
+class ServedRecord:
     """What a simulated robot was told and did, by its own clock."""
 
     commands: int = 0
@@ -100,7 +100,7 @@ class SimulatedUnitree:
             contract,
             end,
             faults or Faults(),
-            Record(),
+            ServedRecord(),
             watchdog,
         )
         self._scene, self._lift = read_scene(folder, contract, whole=True), lift

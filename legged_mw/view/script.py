@@ -23,7 +23,7 @@ FIELDS = ("time", "command", "push", "reset")
 AFTER = 3.0  # [s] ours: how long to watch after the last entry
 
 
-class Entry(NamedTuple):
+class ScriptEntry(NamedTuple):
     """What happens at a time."""
 
     time: float  # [s]
@@ -35,7 +35,7 @@ class Entry(NamedTuple):
 class Script:
     """Entries in their order; the pilot gets each once its time has come."""
 
-    def __init__(self, entries: list[Entry]) -> None:
+    def __init__(self, entries: list[ScriptEntry]) -> None:
         self.entries = entries
         self._next = 0
 
@@ -68,7 +68,7 @@ def load_script(path: Path | str, table: Sequence[Command]) -> Script:
         found = ", ".join(map(str, loaded)) or "nothing"
         example = "{time: 0, command: [0.5, 0, 0]}"
         raise ConfigError(f"{path}: write one list 'commands' with at least one entry, e.g. {example}; it has {found}")
-    entries: list[Entry] = []
+    entries: list[ScriptEntry] = []
     for number, item in enumerate(listed, start=1):
         where = f"{path}: entry {number} of commands"
         entries.append(_entry(item, where, table))
@@ -79,7 +79,7 @@ def load_script(path: Path | str, table: Sequence[Command]) -> Script:
     return Script(entries)
 
 
-def _entry(item: Any, where: str, table: Sequence[Command]) -> Entry:
+def _entry(item: Any, where: str, table: Sequence[Command]) -> ScriptEntry:
     if not isinstance(item, dict) or "time" not in item:
         raise ConfigError(f"{where}: write {{time: [s], ...}} with {', '.join(FIELDS[1:])}; it is {item!r}")
     wrong = [str(key) for key in item if key not in FIELDS]
@@ -96,7 +96,7 @@ def _entry(item: Any, where: str, table: Sequence[Command]) -> Entry:
         raise ConfigError(f"{where}: a push of {math.hypot(*push):g} m/s; at most {PUSH_MAX * 2:g}")
     if not isinstance(item.get("reset", False), bool):
         raise ConfigError(f"{where}: reset is true or false, not {item['reset']!r}")
-    return Entry(time, command, push, item.get("reset", False))
+    return ScriptEntry(time, command, push, item.get("reset", False))
 
 
 def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:

@@ -22,7 +22,7 @@ from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.inputs import Gamepad, StopFile
 from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, read_log
-from legged_mw.deploy.mirror import Mirror
+from legged_mw.deploy.mirror import RobotMonitor
 from legged_mw.deploy.policy import Controller, Network
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.runner import run
@@ -192,7 +192,7 @@ def given_log(seconds: float) -> Run:
 
 def mirror(root: Path) -> None:
     args = SimpleNamespace(viewer="web", camera="follow", host="127.0.0.1", port=0)
-    patched(lambda root: Mirror(GO2_FLAT, CONTRACT, args), sys, executable=shutil.which("false"))(root)  # type: ignore[arg-type]
+    patched(lambda root: RobotMonitor(GO2_FLAT, CONTRACT, args), sys, executable=shutil.which("false"))(root)  # type: ignore[arg-type]
 
 
 def measured_feet() -> None:
