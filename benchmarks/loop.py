@@ -27,10 +27,10 @@ import onnxruntime  # before threads are counted: the package starts one of its 
 
 from legged_mw.deploy.__main__ import find
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import START, WALK, DriveInput
 from legged_mw.deploy.log import Log, read_log
 from legged_mw.deploy.loop import Loop, Spread
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.runner import _Step, run
 from legged_mw.deploy.safety import Limits, Safety

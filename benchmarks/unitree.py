@@ -19,8 +19,8 @@ import numpy as np
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_rules, run_exam
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules

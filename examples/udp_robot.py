@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, RobotError, layout
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import MujocoRobot

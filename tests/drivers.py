@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import DriveInput
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.runner import Summary, run
 from legged_mw.deploy.safety import Limits, Safety

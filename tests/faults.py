@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.controller import Controller, Network
 from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, StopFile
-from legged_mw.deploy.policy import Controller, Network
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety

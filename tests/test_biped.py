@@ -20,7 +20,7 @@ from worlds import QUIET, make_env
 from legged_mw import ROOT
 from legged_mw.check.guard import check_recordable
 from legged_mw.deploy.contract import ContractError, Gait, read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import QUANTITIES, Measurement
 from legged_mw.envs.feet import GaitClock
 from legged_mw.envs.legged_robot import LeggedRobot

@@ -24,8 +24,8 @@ from recorder import Recorder
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_rules, run_exam
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety

@@ -19,11 +19,10 @@ from drivers import Script, Watched
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, ContractError, read_contract
-from legged_mw.deploy.estimate import Estimated
+from legged_mw.deploy.contract import Contract, ContractError, Estimated, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.log import CHUNK, Log, LogError, _columns, log_path, read_log
 from legged_mw.deploy.loop import Loop
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.replay import draw, figures, latency, replay, table
 from legged_mw.deploy.robot import Health
 from legged_mw.deploy.runner import run

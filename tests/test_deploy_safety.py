@@ -15,8 +15,8 @@ from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_rules
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Health, Measurement, Remote, Robot, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import NAMES, LimitError, Limits, Safety, Trip, Tripped, parse_limits

@@ -23,9 +23,9 @@ from drivers import Script, Watched, driven
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import DriveInput, Gamepad, Keys, RobotRemote, StopFile, from_sticks
 from legged_mw.deploy.log import read_log
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Health, Measurement, Remote, RobotError
 from legged_mw.deploy.states import KEPT, STANDS, STEEP, States, at_odds, wrong_imu
 from legged_mw.utils.cli import one_line_errors

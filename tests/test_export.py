@@ -18,7 +18,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import ROWS, ContractError, Ends, read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage

@@ -11,9 +11,9 @@ from drivers import Script, Watched, beyond
 
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.drive import LIFT
 from legged_mw.deploy.joint_check import STEP, JointCheck
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Robot, RobotError
 from legged_mw.deploy.runner import Summary, run
 from legged_mw.deploy.safety import Limits, Safety

@@ -17,7 +17,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import CONTRACT_FILE, read_contract
-from legged_mw.deploy.policy import Controller, Network
+from legged_mw.deploy.controller import Controller, Network
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import crossing

@@ -16,9 +16,9 @@ import pytest
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.odometry import CONTACTS, Odometry
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import QUANTITIES, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import MujocoRobot, read_scene

@@ -14,8 +14,8 @@ from rsl_rl.models import MLPModel
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_skill, perform
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.robot_task import RobotTask

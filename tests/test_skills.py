@@ -16,9 +16,8 @@ from program import refused, run
 from legged_mw import ROOT as REPOSITORY
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import ContractError, read_contract
-from legged_mw.deploy.exam import contract_skill, put_on, run_skill
+from legged_mw.deploy.exam import SwitchStage, contract_skill, put_on, run_skill
 from legged_mw.deploy.simulated import Fleet
-from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import getup, handstand, strip
 from legged_mw.eval.perform import machine, on_ground
 from legged_mw.eval.skill import ExamGround, ExamRobot, Recording

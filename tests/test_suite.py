@@ -24,7 +24,7 @@ from legged_mw import ROOT
 from legged_mw.check.guard import check_recordable
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import Exported, export

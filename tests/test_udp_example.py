@@ -19,7 +19,7 @@ from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import MujocoRobot

@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.unitree import begin
 from legged_mw.deploy.contract import ContractError, ContractRow, read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import RobotError, damped
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import read_scene

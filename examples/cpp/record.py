@@ -12,7 +12,7 @@ import numpy as np
 
 from legged_mw.deploy.__main__ import find
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import Floats, Measurement, layout
 from legged_mw.deploy.simulated import MujocoRobot
 

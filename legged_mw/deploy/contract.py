@@ -3,29 +3,409 @@
 The export writes it from here and ``legged_mw.deploy`` reads it with this. Nothing is stepped and no network is run.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
-from legged_mw.deploy.action import Action, check_pose, read_action, short
-from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
-from legged_mw.deploy.memory import MEMORY, NetworkMemory, read_memory
-from legged_mw.deploy.motion import JOINT_POS, JOINT_VEL, MOTION, PLACE, REFERENCE, TURN, FollowedMotion, read_motion
-from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
-from legged_mw.deploy.reader import MOST_VALUES, Reader, is_list, is_number
-from legged_mw.deploy.reader import ContractError as ContractError
 from legged_mw.deploy.seal import CHECKSUM, FREE, changes, sealed
 from legged_mw.deploy.seal import checksum as checksum
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import UserError, brief, unknown
 from legged_mw.utils.files import digest, finish_moving
+from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
+from legged_mw.utils.motor_network import Floats, MotorNetwork, read_network
+
+# ---- typed values of a contract -------------------------------------------------------------------------------------
+
+
+MOST = 1e6  # no quantity of a robot is larger, in any unit
+MOST_VALUES = 10_000_000  # of an observation: a camera's picture has a tenth
+
+
+class ContractError(UserError, ValueError):
+    """An export that cannot be deployed; the text names the file, what it states, what was expected and what to do."""
+
+
+class Reader:
+    """Takes typed values out of a mapping; a missing or ill-typed one is one clear line."""
+
+    def __init__(self, values: Mapping[str, Any], where: str) -> None:
+        self.values, self.where = values, where
+
+    def take(self, key: str, wanted: str, fits: Callable[[Any], bool]) -> Any:
+        """The value of ``key`` if it fits; ``wanted`` are the words for what does."""
+        if key not in self.values or not fits(self.values[key]):
+            found = f"is {brief(self.values[key])}" if key in self.values else "is missing"
+            raise ContractError(f"{self.where}: '{key}' {found}; it must be {wanted}")
+        return self.values[key]
+
+    def section(self, key: str) -> Reader:
+        return Reader(self.take(key, "a mapping", lambda v: isinstance(v, dict)), f"{self.where}: {key}")
+
+    def sections(self, key: str, empty: bool = False) -> list[Reader]:
+        items = self.take(key, "a list of mappings", lambda v: is_list(v, lambda item: isinstance(item, dict), empty))
+        return [Reader(item, f"{self.where}: {key}[{i}]") for i, item in enumerate(items)]
+
+    def text(self, key: str, empty: bool = False) -> str:
+        return self.take(key, "text", lambda v: isinstance(v, str) and (empty or v != ""))
+
+    def texts(self, key: str, empty: bool = False) -> tuple[str, ...]:
+        return tuple(self.take(key, "a list of names", lambda v: is_list(v, lambda item: isinstance(item, str), empty)))
+
+    def count(self, key: str, most: int = MOST_VALUES) -> int:
+        value = self.take(
+            key, "a whole number from 1", lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= 1
+        )
+        return value if value <= most else self.take(key, f"{most} at most", lambda v: False)
+
+    def number(self, key: str, low: float = -MOST, high: float = MOST) -> float:
+        beyond = is_number(self.values.get(key)) and abs(self.values[key]) > MOST
+        limits = (f" from {low:g}" if beyond or low > -MOST else "") + (
+            f" to {high:g}" if beyond or high < MOST else ""
+        )
+        return float(self.take(key, f"a number{limits}", lambda v: is_number(v) and low <= v <= high))
+
+    def above_zero(self, key: str, high: float = MOST) -> float:
+        self.number(key, -MOST, high)
+        return float(self.take(key, "above zero", lambda v: v > 0))
+
+    def numbers(self, key: str, count: int, of: str, low: float = -MOST, high: float = MOST) -> np.ndarray:
+        value = self.take(key, f"{count} numbers, one a {of}", lambda v: is_list(v, is_number) and len(v) == count)
+        self.take(key, f"numbers from {low:g} to {high:g}", lambda v: low <= min(v) and max(v) <= high)
+        return np.array(value, dtype=float)
+
+    def file(self, key: str, name: str) -> None:
+        """An export's files have fixed names and lie beside the contract, whoever wrote it."""
+        if key in self.values:
+            self.take(key, f"{name}, which lies beside {self.where.partition(':')[0]}", lambda v: v == name)
+
+    def scale(self, count: int, of: str) -> np.ndarray:
+        """``scale`` as one number a value; one for all may stand for them."""
+        wanted = f"a number, or {count} numbers, one a {of}"
+        value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
+        self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
+        return np.full(count, value, dtype=float) if is_number(value) else np.array(value, dtype=float)
+
+
+def compile_scene(file: Path) -> Any:
+    """The model in an export's scene. Raises ContractError."""
+    from legged_mw.utils.mjcf import Source, check_model  # which bring MuJoCo
+
+    try:
+        model = Source(file, alone=True).spec().compile()
+        check_model(model)
+    except (ValueError, OSError) as error:
+        raise ContractError(f"{file.name} is not a valid MJCF: {' '.join(str(error).split())}") from None
+    return model
+
+
+def is_number(value: object) -> bool:
+    # a whole number may be no float
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+
+
+def is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> bool:
+    return isinstance(value, list) and (empty or len(value) > 0) and all(map(fits, value))
+
+
+# ---- the action -----------------------------------------------------------------------------------------------------
+
+
+ORIGINS = ("default", "joints", "targets", "torque", "speed")
+_LARGEST = 1000.0  # [L] clips at 100
+_BEYOND = 1e-3  # [rad] that a pose may be beyond its range by rounding
+
+
+class Action(NamedTuple):
+    """What an action means: joint target = origin + scale * action [rad], or torque [N m] or speed [rad/s] = scale * action.
+
+    The policy's own target is what limits judge, and what the origin "targets" goes on from; a servo gets it `held`.
+    """
+
+    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": none
+    scale: np.ndarray  # (D,) [rad], [N m] or [rad/s]
+    clip: float  # |action| at most [-]
+    lowest: np.ndarray  # (D,) what a servo is told at least, as in training; MOST either way: anything
+    highest: np.ndarray  # (D,) and at most
+
+    def held(self, targets: np.ndarray) -> np.ndarray:
+        """``targets`` (..., D) within the range; NaN stays."""
+        return np.clip(targets, self.lowest, self.highest)
+
+    def to_dict(self) -> dict[str, Any]:
+        values = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in self._asdict().items()
+        }
+        return values | {"scale": short(values["scale"])}
+
+
+def short(values: Sequence[float]) -> float | list[float]:
+    """One number where all are the same."""
+    return values[0] if len(set(values)) == 1 else list(values)
+
+
+def read_action(action: Reader, joints: Sequence[str], scene: Path | None) -> Action:
+    """From the contract's reader of the section; ``scene``: where a contract is too old to state the range."""
+    origin, count = action.take("origin", f"one of {', '.join(ORIGINS)}", lambda v: v in ORIGINS), len(joints)
+    scale = action.scale(count, "joint")
+    action.take("scale", "other than 0, which moves nothing", lambda _: bool(scale.any()))
+    clip = action.above_zero("clip", _LARGEST)
+    if scene:
+        return Action(origin, scale, clip, *_range_of_scene(scene, joints))
+    lowest, highest = (action.numbers(key, count, "joint") for key in ("lowest", "highest"))
+    action.take("highest", "at least `lowest`", lambda _: bool((lowest <= highest).all()))
+    return Action(origin, scale, clip, lowest, highest)
+
+
+def target_range(model: mujoco.MjModel, actuators: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest target (D,) that these motors obey; MOST either way where they obey any."""
+    held, ranges = model.actuator_ctrllimited[list(actuators), None] > 0, model.actuator_ctrlrange[list(actuators)]
+    lowest, highest = np.where(held, ranges, [-MOST, MOST]).T
+    return lowest, highest
+
+
+def _range_of_scene(scene: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    if not scene.is_file():
+        raise ContractError(
+            f"policy.yaml is of a format that leaves the range of the targets to {scene.name}, which is not beside it: put it there, "
+            "or export the policy again"
+        )
+    model = compile_scene(scene)
+    names = [model.actuator(i).name for i in range(model.nu)]
+    if missing := [name for name in joints if name not in names]:
+        raise ContractError(f"policy.yaml: joints: {unknown('servo', missing[0], names, scene.name)}")
+    return target_range(model, [names.index(name) for name in joints])
+
+
+def check_pose(action: Action, joints: Sequence[str], pose: np.ndarray) -> None:
+    """Raises ContractError where ``pose`` (D,) [rad] is beyond the range."""
+    for joint in np.flatnonzero((pose < action.lowest - _BEYOND) | (pose > action.highest + _BEYOND)).tolist():
+        raise ContractError(
+            f"policy.yaml: default_pose of {joints[joint]} is {pose[joint]:g} rad, beyond the range of its targets, "
+            f"{action.lowest[joint]:g} to {action.highest[joint]:g} rad (action: lowest, highest)"
+        )
+
+
+# ---- what the policy estimates --------------------------------------------------------------------------------------
+
+
+ESTIMATE = "estimate"  # the output's name, and the contract's section that lists its rows
+
+
+class Estimated(NamedTuple):
+    """One row of the output."""
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+
+
+def read_estimated(rows: Sequence[Any]) -> tuple[Estimated, ...]:
+    """The rows from the contract's readers of ``estimate``."""
+    return tuple(
+        Estimated(row.text("name"), row.count("size"), row.text("unit", empty=True), row.text("frame", empty=True))
+        for row in rows
+    )
+
+
+def columns_of(rows: Sequence[Estimated], name: str) -> slice | None:
+    """Columns of the row ``name`` in the output; None if it is not estimated."""
+    start = 0
+    for row in rows:
+        if row.name == name:
+            return slice(start, start + row.size)
+        start += row.size
+    return None
+
+
+# ---- the memory of a recurrent network ------------------------------------------------------------------------------
+
+
+MEMORY = "memory"  # the contract's section, inside of `network`
+
+
+class NetworkMemory(NamedTuple):
+    """An input and an output of the network, (batch, *shape) each: what goes out goes in at the next step, at first zeros."""
+
+    input: str
+    output: str
+    shape: tuple[int, ...]  # layers, values each; of an LSTM the layers' h, then their c
+
+    def start(self, count: int) -> NDArray[np.float32]:
+        """Of ``count`` robots that remember nothing."""
+        return np.zeros((count, *self.shape), dtype=np.float32)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**self._asdict(), "shape": list(self.shape)}
+
+
+def read_memory(section: Reader) -> NetworkMemory:
+    """From the contract's reader of the section."""
+    wanted = "two whole numbers from 1: states and the size of each"
+    shape = section.take(
+        "shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
+    )
+    section.take("shape", f"{MOST_VALUES} values at most", lambda v: v[0] * v[1] <= MOST_VALUES)
+    return NetworkMemory(section.text("input"), section.text("output"), tuple(shape))
+
+
+# ---- the motion that a policy follows -------------------------------------------------------------------------------
+
+
+MOTION, MOTION_FILE = "motion", "motion.npz"  # the contract's section; the file, as legged_mw.skills.clip has it
+JOINT_POS, JOINT_VEL, PLACE, TURN = "reference_joint_pos", "reference_joint_vel", "anchor_pos", "anchor_ori"
+REFERENCE = (JOINT_POS, JOINT_VEL, PLACE, TURN)  # what the controller makes of it
+# in Measurement.others: of the root, (4,) w x y z, and (3,) [m], world frame
+ATTITUDE, POSITION = "attitude", "position"
+
+
+class FollowedMotion(NamedTuple):
+    """What is followed: at the anchor, and with which bodies."""
+
+    anchor: str
+    bodies: tuple[str, ...]  # that were compared in training
+    digest: str  # SHA-256 of MOTION_FILE
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"file": MOTION_FILE, "sha256": self.digest, "anchor": self.anchor, "bodies": list(self.bodies)}
+
+
+def read_motion(section: Reader) -> FollowedMotion:
+    """From the contract's reader of the section."""
+    bodies = section.texts("bodies")
+    section.file("file", MOTION_FILE)
+    return FollowedMotion(
+        section.take("anchor", "one of `bodies`", lambda v: v in bodies), bodies, section.text("sha256")
+    )
+
+
+# ---- motors ---------------------------------------------------------------------------------------------------------
+
+
+MOTORS, MOTORS_FILE = "motors", "motors.npz"
+LAWS = ("servo", "dc_motor", "torque", "network")  # docs/motors.md
+_ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "relu": lambda x: np.maximum(x, 0),
+    "softsign": lambda x: x / (1 + np.abs(x)),
+    "tanh": np.tanh,
+}
+
+
+class Motors(NamedTuple):
+    """What turns a joint target into a torque; a real robot's motors are their own law."""
+
+    law: str = "servo"
+    stall_torque: tuple[float, ...] = ()  # (D,) [N m] at the joint; empty: no torque-speed curve
+    no_load_speed: tuple[float, ...] = ()  # (D,) [rad/s] likewise
+    digest: str = ""  # SHA-256 of the network's file
+
+    def to_dict(self) -> dict[str, Any]:
+        """The section; nothing for servos."""
+        curve = (
+            {"stall_torque": list(self.stall_torque), "no_load_speed": list(self.no_load_speed)}
+            if self.stall_torque
+            else {}
+        )
+        network = {"file": MOTORS_FILE, "sha256": self.digest} if self.digest else {}
+        return {MOTORS: {"law": self.law, **curve, **network}} if self.law != "servo" else {}
+
+    def gains(self, model: mujoco.MjModel, actuators: list[int], dofs: np.ndarray) -> dict[str, np.ndarray]:
+        """What ``model`` has of gains and curve, one a joint each, by the contract's names."""
+        prm = model.actuator_gainprm[actuators]
+        found = {}
+        if self.law == "servo":
+            found = {"stiffness": prm[:, 0], "damping": model.dof_damping[dofs].reshape(len(dofs), -1)[:, 0]}
+        elif self.law == "dc_motor":
+            found = {"stiffness": prm[:, DC_STIFFNESS], "damping": prm[:, DC_DAMPING]}
+        if self.stall_torque:
+            constant, resistance = np.maximum(prm[:, DC_CONSTANT], 1e-12), np.maximum(prm[:, DC_RESISTANCE], 1e-12)
+            found |= {"motors: stall_torque": constant / resistance, "motors: no_load_speed": 1.0 / constant}
+        return found
+
+    def limp(self, batch: Any) -> None:
+        """Switch the motors of ``batch``, which are no servos, off: what is left is damping, if there is any."""
+        if self.law == "dc_motor":
+            batch.expand("actuator_gainprm")[:, :, DC_STIFFNESS] = 0.0
+        else:
+            batch.expand("actuator_gear")[:] = 0.0
+
+
+SERVOS = Motors()
+
+
+def read_motors(section: Reader, joints: int) -> Motors:
+    """The motors from the contract's reader of the section ``motors``."""
+    law = section.take("law", f"one of {', '.join(LAWS)}", lambda value: value in LAWS)
+    section.file("file", MOTORS_FILE)
+    names = ("stall_torque", "no_load_speed") if law == "dc_motor" or "stall_torque" in section.values else ()
+    curve = {name: tuple(section.numbers(name, joints, "joint").tolist()) for name in names}
+    for name in names:
+        section.take(name, "numbers above zero", lambda value: min(value) > 0)
+    return Motors(law, digest=section.text("sha256") if law == "network" else "", **curve)
+
+
+def make_network(folder: Path, motors: Motors, count: int, joints: int) -> NetworkMotors | None:
+    """The motors of ``count`` robots, where they are a network. Raises ContractError, or UserError for a broken one."""
+    if motors.law != "network":
+        return None
+    if not (folder / MOTORS_FILE).is_file():
+        raise ContractError(f"no {MOTORS_FILE} in {folder}, the network of its motors; export the policy again")
+    if digest(folder / MOTORS_FILE) != motors.digest:
+        raise ContractError(
+            f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again"
+        )
+    return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)
+
+
+class NetworkMotors:
+    """The motors of N robots with D joints: ``torque`` is called once a simulation step."""
+
+    def __init__(self, network: MotorNetwork, robots: int, joints: int) -> None:
+        self.network = network
+        # newest first; errors, speeds, scaled
+        self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)
+        # h and c of each layer
+        self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]
+
+    def reset(self, which: Any = slice(None)) -> None:
+        """The robots ``which`` (indices or a mask) begin again: nothing was ever off its target."""
+        for memory in (self._past, *self._memory):
+            memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
+
+    def torque(self, error: NDArray[Any], speed: NDArray[Any]) -> Floats:
+        """Torques (N, D) [N m] from target minus angle [rad] and speed [rad/s], (N, D) each."""
+        net, past = self.network, self._past
+        past[1:] = past[:-1].copy()
+        past[0] = net.error_scale * error, net.speed_scale * speed
+        x = np.moveaxis(past[list(net.frames)], (0, 1), (-2, -1) if net.in_turns else (-1, -2))
+        x = x.reshape(*error.shape, -1)
+        for memory, (w_x, w_h, b_x, b_h) in zip(self._memory, net.recurrent, strict=True):
+            i, f, g, o = np.split(x @ w_x.T + b_x + memory[0] @ w_h.T + b_h, 4, axis=-1)
+            memory[1] = _sigmoid(f) * memory[1] + _sigmoid(i) * np.tanh(g)
+            x = memory[0] = _sigmoid(o) * np.tanh(memory[1])
+        for layer, (weight, bias) in enumerate(net.linear):
+            x = x @ weight.T + bias
+            if layer < len(net.linear) - 1:
+                x = _ACTIVATIONS[net.activation](x)
+        return net.torque_scale * x[..., 0]
+
+
+def _sigmoid(x: Floats) -> Floats:
+    return 1 / (1 + np.exp(-np.clip(x, -80.0, 80.0)))
+
 
 FORMATS = (2, 3, 4, 5)  # 5: the range of targets, and checksums of the scenes; older ones take the range from the scene
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import Gamepad, InputSource, Keys, RobotRemote, StopFile
 from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, log_path
 from legged_mw.deploy.mirror import FLAGS, LIVE, RobotMonitor
 from legged_mw.deploy.odometry import Odometry
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety, parse_limits

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import END, START, InputSource
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import read_scene

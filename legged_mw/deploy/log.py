@@ -22,12 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, TERRAIN_FILE, Contract
-from legged_mw.deploy.estimate import ESTIMATE
+from legged_mw.deploy.contract import (
+    CONTRACT_FILE,
+    ESTIMATE,
+    MOTION_FILE,
+    MOTORS_FILE,
+    NETWORK_FILE,
+    SCENE_FILE,
+    TERRAIN_FILE,
+    Contract,
+)
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.loop import Loop
-from legged_mw.deploy.motion import MOTION_FILE
-from legged_mw.deploy.motors import MOTORS_FILE
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, layout
 from legged_mw.deploy.states import POLICY, STATES, Order
 from legged_mw.utils.errors import UserError, shown

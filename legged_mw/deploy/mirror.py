@@ -25,9 +25,8 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.inputs import DriveInput
-from legged_mw.deploy.pose import place
 from legged_mw.deploy.robot import Floats, Health, Measurement
-from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.simulated import place, read_scene
 from legged_mw.deploy.states import POLICY, States
 from legged_mw.utils.errors import UserError
 from legged_mw.view import launch

@@ -17,15 +17,13 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.estimate import ESTIMATE, columns_of
+from legged_mw.deploy.contract import ESTIMATE, Contract, columns_of, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.log import DriveLog, LogError, read_log
 from legged_mw.deploy.loop import Spread
-from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.pose import place
 from legged_mw.deploy.robot import QUANTITIES, Floats
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.deploy.simulated import MujocoRobot
+from legged_mw.deploy.simulated import MujocoRobot, place
 from legged_mw.deploy.states import POLICY, STATES
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.errors import UserError, shown

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import OWN, Contract, quantity_size
-from legged_mw.deploy.motion import ATTITUDE, PLACE, POSITION
+from legged_mw.deploy.contract import ATTITUDE, OWN, PLACE, POSITION, Contract, quantity_size
 from legged_mw.utils.errors import UserError
 
 Floats = NDArray[np.float64]

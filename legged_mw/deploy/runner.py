@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.log import Log
 from legged_mw.deploy.loop import Loop, Timing
 from legged_mw.deploy.odometry import Odometry
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import TORQUE, Limits, Safety, Trip, Tripped
 from legged_mw.deploy.states import DAMPING, POLICY, ZERO, Order, States

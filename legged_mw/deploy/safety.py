@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract, part
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract, compile_scene, part
 from legged_mw.deploy.loop import LATE
-from legged_mw.deploy.reader import compile_scene
 from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
 

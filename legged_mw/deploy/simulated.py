@@ -9,6 +9,7 @@ acceleration) is one physics step old, as it was in training. Contact was one st
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,25 +20,55 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import ArrayLike, NDArray
 
-from legged_mw.deploy.action import target_range
 from legged_mw.deploy.contract import (
+    ATTITUDE,
     CONTRACT_FILE,
     FALL,
+    POSITION,
     SCAN,
     SCENE_FILE,
     SENSED,
     TERRAIN_FILE,
     Contract,
     ContractError,
+    make_network,
     part,
     quantity_size,
+    target_range,
 )
-from legged_mw.deploy.motion import ATTITUDE, POSITION
-from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
 from legged_mw.utils.mjcf import Source, check_model
+
+# ---- a robot placed by its measurements -----------------------------------------------------------------------------
+
+
+def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity: Floats, heading: float = 0.0) -> None:
+    """Put the robot over its place (x, y) in ``data``: ``angles`` (D,) [rad] of ``joints``, ``gravity`` (3,) in the body, heading [rad]."""
+    data.qpos[[model.joint(name).qposadr[0] for name in joints]] = angles
+    up, tilt, turn = -gravity / np.linalg.norm(gravity), np.zeros(4), np.zeros(4)  # z axis of the world, in the body
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])  # level, or upside down
+    mujoco.mju_axisAngle2Quat(tilt, axis, math.acos(np.clip(up[2], -1.0, 1.0)))
+    mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), heading)
+    mujoco.mju_mulQuat(data.qpos[3:7], turn, tilt)
+    mujoco.mj_kinematics(model, data)
+    touching = np.flatnonzero((model.geom_conaffinity > 0) & (model.geom_bodyid > 0)).tolist()
+    lowest = [data.geom_xpos[i, 2] - _reach(model, i, data.geom_xmat[i]) for i in touching]
+    data.qpos[2] -= min(lowest, default=0.0)
+
+
+def _reach(model: Any, geom: int, turn: Floats) -> float:
+    """How far a sphere or capsule reaches down from its centre [m]; of another shape the box around it."""
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return size[0] + abs(turn[8]) * size[1]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return size[0]
+    return float(np.abs(turn[6:]) @ model.geom_aabb[geom, 3:] - turn[6:] @ model.geom_aabb[geom, :3])
+
 
 Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.odometry import Odometry
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Change, Fleet
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import END, START, WALK, InputSource
 from legged_mw.deploy.odometry import Odometry
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
 

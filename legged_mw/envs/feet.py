@@ -3,7 +3,7 @@
 The clock says where each foot is in its step, as a policy sees it and as rewards want it. Period and offsets are the config's.
 A world's phase runs from 0 to 1 in a period. Each foot's phase is that plus its offset. A foot stands in the first share of
 its phase (``gait.stance``) and swings in the rest. The clock rests at 0 while the robot is told to stand, and runs from 0 when
-it is told to move. ``legged_mw.deploy.gait`` keeps the same clock.
+it is told to move. ``legged_mw.deploy.controller`` keeps the same clock.
 """
 
 from __future__ import annotations

@@ -18,28 +18,31 @@ import numpy as np
 import torch
 from rsl_rl.models import MLPModel, RNNModel
 
-from legged_mw.deploy.action import Action, target_range
 from legged_mw.deploy.contract import (
     CLOCK,
     CONTRACT_FILE,
     FALL,
+    MOTION_FILE,
+    MOTORS_FILE,
     NETWORK_FILE,
     ROWS,
     SCAN,
     SCENE_FILE,
     SENSORS,
     TERRAIN_FILE,
+    Action,
     Contract,
     ContractRow,
     Ends,
+    Estimated,
+    FollowedMotion,
     Gait,
     HeightScan,
+    Motors,
+    NetworkMemory,
     read_contract,
+    target_range,
 )
-from legged_mw.deploy.estimate import Estimated
-from legged_mw.deploy.memory import NetworkMemory
-from legged_mw.deploy.motion import MOTION_FILE, FollowedMotion
-from legged_mw.deploy.motors import MOTORS_FILE, Motors
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.motors import OWN as OWN_LAW

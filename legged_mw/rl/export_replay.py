@@ -12,7 +12,7 @@ import torch
 from rsl_rl.models import MLPModel
 
 from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, Contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot

@@ -12,8 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from legged_mw.deploy.contract import COMPUTED, CONTRACT_FILE, Contract
-from legged_mw.deploy.motion import ATTITUDE, PLACE
+from legged_mw.deploy.contract import ATTITUDE, COMPUTED, CONTRACT_FILE, PLACE, Contract
 from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene

@@ -1,6 +1,6 @@
 """A motor as a small network of numbers: from how far a joint is off its target and how fast it turns, lately, to its torque.
 
-The same network serves each joint. It is read from an .npz without running code; envs/motors.py and deploy/motors.py evaluate it.
+The same network serves each joint. It is read from an .npz without running code; envs/motors.py and deploy/contract.py evaluate it.
 """
 
 from __future__ import annotations

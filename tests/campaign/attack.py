@@ -35,7 +35,7 @@ import pytest
 from program import files, stopped_at_work
 
 from legged_mw import programs
-from legged_mw.deploy.policy import limited_memory
+from legged_mw.deploy.controller import limited_memory
 from legged_mw.rl import policies, runs
 from legged_mw.utils.cli import one_line_errors
 

@@ -28,9 +28,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import checksum, edits, read_contract
-from legged_mw.deploy.motors import NetworkMotors
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.contract import NetworkMotors, checksum, edits, read_contract
+from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import save_whole

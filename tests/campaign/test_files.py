@@ -23,9 +23,9 @@ from onnx import TensorProto, helper
 from program import SMALL
 
 from legged_mw import ROOT
-from legged_mw.deploy import policy
+from legged_mw.deploy import controller as policy
 from legged_mw.deploy.contract import checksum, read_contract
-from legged_mw.deploy.policy import Network
+from legged_mw.deploy.controller import Network
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.rl import runner as running
 from legged_mw.rl.checkpoint import sealed

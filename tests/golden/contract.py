@@ -13,13 +13,10 @@ from test_files import in_scene, says_else, set_at
 
 from golden.table import Run, Table, patched
 from legged_mw import ROOT
-from legged_mw.deploy.contract import CHECKSUM, CLOCK, checksum, read_contract
+from legged_mw.deploy.contract import CHECKSUM, CLOCK, JOINT_POS, Motors, checksum, make_network, read_contract
+from legged_mw.deploy.controller import Controller, Follower, Network
 from legged_mw.deploy.exam import contract_rules, contract_skill
-from legged_mw.deploy.follow import Follower
-from legged_mw.deploy.motion import JOINT_POS
-from legged_mw.deploy.motors import Motors, make_network
 from legged_mw.deploy.odometry import Odometry
-from legged_mw.deploy.policy import Controller, Network
 from legged_mw.deploy.robot import QUANTITIES, Measurement
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import read_scene

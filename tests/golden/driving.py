@@ -17,13 +17,13 @@ from drivers import Script, Watched, driven
 
 from golden.table import Run, Table, patched, without
 from legged_mw import ROOT
-from legged_mw.deploy import options, replay
+from legged_mw.deploy import __main__, replay
 from legged_mw.deploy.contract import ContractRow, read_contract
+from legged_mw.deploy.controller import Controller, Network
 from legged_mw.deploy.inputs import Gamepad, StopFile
 from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, read_log
 from legged_mw.deploy.mirror import RobotMonitor
-from legged_mw.deploy.policy import Controller, Network
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits
@@ -197,7 +197,7 @@ def mirror(root: Path) -> None:
 
 def measured_feet() -> None:
     args = SimpleNamespace(velocity="odometry", robot="unitree", contact="measured")
-    options.contact(args, read_contract(ROOT / "resources/policies/g1_flat"))  # type: ignore[arg-type]
+    __main__.contact_source(args, read_contract(ROOT / "resources/policies/g1_flat"))  # type: ignore[arg-type]
 
 
 def table() -> Table:

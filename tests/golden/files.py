@@ -13,9 +13,9 @@ from attack import Case
 from test_files import ACTOR, ADAM, drop, set_at
 
 from golden.table import Run, Table, patched
-from legged_mw.deploy import policy
+from legged_mw.deploy import controller as policy
 from legged_mw.deploy.contract import read_contract
-from legged_mw.deploy.policy import Network
+from legged_mw.deploy.controller import Network
 from legged_mw.rl import network
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import find_checkpoint, find_run, load_tensors, new_run, save_whole

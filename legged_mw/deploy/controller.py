@@ -1,7 +1,10 @@
 """The network of an export and the controller around it: measurement and command in, servo targets out. No robot, no clock."""
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -9,17 +12,173 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import CLOCK, CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
-from legged_mw.deploy.estimate import ESTIMATE, columns_of
-from legged_mw.deploy.follow import Follower
-from legged_mw.deploy.gait import GaitPhase
+from legged_mw.deploy.contract import (
+    ATTITUDE,
+    CLOCK,
+    CONTRACT_FILE,
+    ESTIMATE,
+    JOINT_POS,
+    JOINT_VEL,
+    MOTION_FILE,
+    NETWORK_FILE,
+    OWN,
+    PLACE,
+    POSITION,
+    SCENE_FILE,
+    TURN,
+    Contract,
+    ContractError,
+    columns_of,
+    compile_scene,
+    digest,
+    part,
+)
 from legged_mw.deploy.robot import Measurement
+from legged_mw.skills.clip import Clip, conjugate, heading, multiply, read_clip
+from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.errors import UserError
 
 Floats = NDArray[np.floating[Any]]
+Doubles = NDArray[np.float64]
+
+# ---- the gait clock -------------------------------------------------------------------------------------------------
+
+
+class GaitPhase:
+    """Clocks of ``count`` robots with F feet; it moves on by the contract's period with each ``keep``."""
+
+    def __init__(self, contract: Contract, count: int) -> None:
+        """``contract`` has a section ``gait``."""
+        assert contract.gait
+        self._gait, self._share = contract.gait, contract.period / contract.gait.period
+        names = [command.name for command in contract.commands]
+        self._velocity = [names.index(name) for name in VELOCITY]
+        self.phase: Floats = np.zeros(count)  # share of the period, of the last step
+        self.running: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # likewise: told to move
+        self.start: Floats = np.zeros(count)  # where a robot's clock is at its first step, if that is told to move
+
+    def row(self, commands: Floats, fresh: NDArray[np.bool_]) -> Floats:
+        """Sine of each foot's phase, then cosine (N, 2F); zeros at rest. ``fresh`` (N,) are robots at their first step."""
+        phase, running = self._next(commands, fresh)
+        angle = 2.0 * math.pi * (phase[:, None] + np.array(self._gait.offsets))
+        return np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * running[:, None]
+
+    def keep(self, commands: Floats, fresh: NDArray[np.bool_]) -> None:
+        """A step with these ``commands`` (N, C) was made."""
+        self.phase, self.running = self._next(commands, fresh)
+
+    def _next(self, commands: Floats, fresh: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+        """Phase and whether it runs (N,), in the step to come."""
+        velocity = np.atleast_2d(commands)[:, self._velocity]
+        running = np.broadcast_to((velocity**2).sum(axis=1) > self._gait.min_command**2, self.running.shape)
+        phase = np.where(fresh, self.start, np.where(self.running, (self.phase + self._share) % 1.0, 0.0))
+        return np.where(running, phase, 0.0), running.copy()
+
+
+# ---- the motion that is followed ------------------------------------------------------------------------------------
+
+
+class Follower:
+    """The phase of ``count`` robots: the frame that each is to reach in the step to come. After the last frame it is held.
+
+    A real robot does not know where in the world it is: as it begins, the motion is moved and turned to where the robot stands.
+    """
+
+    def __init__(self, folder: Path, contract: Contract, count: int) -> None:
+        """The file that ``contract.motion`` names. Raises ContractError for another one."""
+        assert contract.motion
+        file = folder / MOTION_FILE
+        if not file.is_file() or digest(file) != contract.motion.digest:
+            raise ContractError(
+                f"{file} is missing, or not the motion that the policy was exported with; export the policy again"
+            )
+        self.clip: Clip = read_clip(file).at(1.0 / contract.period).of(contract.joints, MOTION_FILE)
+        self._model = compile_scene(part(folder, SCENE_FILE))
+        self._data, self._anchor = mujoco.MjData(self._model), self._model.body(contract.motion.anchor).id
+        self._angles = [int(self._model.joint(name).qposadr[0]) for name in contract.joints]
+        # the last frame is held at rest
+        speed = np.concatenate([self.clip.qvel()[:, 6:], np.zeros((1, len(contract.joints)))])
+        self._joints = np.concatenate([self.clip.joint_pos, self.clip.joint_pos[-1:]]), speed
+        place, turn = self._anchors(self.clip.root_pos, self.clip.root_quat, self.clip.joint_pos)
+        self._place, self._turn = np.concatenate([place, place[-1:]]), np.concatenate([turn, turn[-1:]])
+        self.frame = np.ones(count, dtype=int)
+        self.start: NDArray[np.int64] | None = None  # frames to be at instead, in the world's own frame: as in training
+        self._shift, self._heading = np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+
+    def rows(self, measured: Measurement, fresh: NDArray[np.bool_]) -> dict[str, Doubles]:
+        """What the policy sees (N, ...); ``fresh`` (N,) are robots at their first step."""
+        place, turn = self._measured(measured)
+        shift, turned = self._moved(place, turn, fresh)
+        frame = self._now()
+        there, wanted = _rotate(turned, self._place[frame]) + shift, multiply(turned, self._turn[frame])
+        off = _matrix(multiply(conjugate(turn), wanted))
+        rows = {JOINT_POS: self._joints[0][frame], JOINT_VEL: self._joints[1][frame]}
+        return rows | {PLACE: _rotate(conjugate(turn), there - place), TURN: off[:, :, :2].reshape(len(off), 6)}
+
+    def keep(self, measured: Measurement, fresh: NDArray[np.bool_]) -> None:
+        """A step was made."""
+        self._shift, self._heading = self._moved(*self._measured(measured), fresh)
+        self.frame = np.minimum(self._now() + 1, len(self._place) - 1)
+
+    def reset(self, which: Any) -> None:
+        """The robots ``which`` are at the first frame."""
+        self.frame[which] = 1
+
+    def ghost(self) -> Doubles:
+        """The frames that come next, where the motion was moved to: (N, nq) of the scene."""
+        frame = np.minimum(self._now(), len(self.clip.root_pos) - 1)
+        states = np.zeros((len(frame), self._model.nq))
+        states[:, :3] = _rotate(self._heading, self.clip.root_pos[frame]) + self._shift
+        states[:, 3:7], states[:, self._angles] = (
+            multiply(self._heading, self.clip.root_quat[frame]),
+            self.clip.joint_pos[frame],
+        )
+        return states
+
+    def _now(self) -> NDArray[np.int64]:
+        return np.minimum(self.frame if self.start is None else self.start, len(self._place) - 1)
+
+    def _measured(self, measured: Measurement) -> tuple[Doubles, Doubles]:
+        """Place (N, 3) and attitude (N, 4) of the anchor; from the root's and the joints' measured angles."""
+        attitude = np.atleast_2d(measured.others[ATTITUDE])
+        root = np.atleast_2d(measured.others.get(POSITION, np.zeros((len(attitude), 3))))
+        return self._anchors(root, attitude, np.atleast_2d(measured.joint_pos))
+
+    def _anchors(self, root: Doubles, attitude: Doubles, joints: Doubles) -> tuple[Doubles, Doubles]:
+        place, turn = np.zeros((len(root), 3)), np.zeros((len(root), 4))
+        for i in range(len(root)):
+            self._data.qpos[:3], self._data.qpos[3:7], self._data.qpos[self._angles] = root[i], attitude[i], joints[i]
+            mujoco.mj_kinematics(self._model, self._data)
+            place[i], turn[i] = self._data.xpos[self._anchor], self._data.xquat[self._anchor]
+        return place, turn
+
+    def _moved(self, place: Doubles, turn: Doubles, fresh: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
+        """How the motion is moved (N, 3) and turned (N, 4); where ``fresh``, to the robot's own place and heading."""
+        if self.start is not None:
+            return self._shift, self._heading
+        before = self._now() - 1
+        turned = np.where(fresh[:, None], heading(multiply(turn, conjugate(self._turn[before]))), self._heading)
+        shift = (place - _rotate(turned, self._place[before])) * [1.0, 1.0, 0.0]
+        return np.where(fresh[:, None], shift, self._shift), turned
+
+
+def _rotate(q: Doubles, v: Doubles) -> Doubles:
+    """Vectors (N, 3) turned by ``q`` (N, 4)."""
+    return (_matrix(q) @ v[..., None])[..., 0]
+
+
+def _matrix(q: Doubles) -> Doubles:
+    """(N, 3, 3) of quaternions (N, 4)."""
+    matrices = np.zeros((len(q), 9))
+    for matrix, each in zip(matrices, q, strict=True):
+        mujoco.mju_quat2Mat(matrix, each)
+    return matrices.reshape(-1, 3, 3)
+
+
 _FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # of the first call: networks of robots take a thousandth of either
 
 
