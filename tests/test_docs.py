@@ -26,7 +26,7 @@ from legged_mw.view import playing
 PAGES = [
     *sorted(ROOT.glob("README*.md")),
     ROOT / "examples/cpp/README.md",
-    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(page for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "archive"),  # frozen, word for word
     *sorted((ROOT / "resources").rglob("*.md")),
 ]
 ELSEWHERE = {"your_own_robot.md": "tests/test_your_own_robot.py runs its commands, one after the other"}
