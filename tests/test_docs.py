@@ -54,7 +54,7 @@ SMALL += (
 GROUND = "--set terrain.num_rows=1 --set terrain.num_cols=8 --set terrain.border_size=1"
 OF_TASKS = {"rough": GROUND, "craters": GROUND, "getup": "--set falls.states=8"}
 # that pages say to save
-FILES = {"go1_gentle.py": "index.md", "go1_estimator.py": "tasks.md", "go1_craters.py": "terrain.md"}
+FILES = {"go1_gentle.py": "index.md", "go1_estimator.py": "observations.md", "go1_craters.py": "terrain.md"}
 
 
 @pytest.fixture(autouse=True, scope="module")
