@@ -188,3 +188,9 @@ def test_links_lead_somewhere(page: Path) -> None:
         if not target.exists() or (anchor and anchor not in anchors(target)):
             lost.append(link)
     assert lost == []
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
+def test_a_page_is_short(page: Path) -> None:
+    """The tutorial is a course; of all others a reader in a hurry finds what is asked for."""
+    assert page.name == "tutorial.md" or len(page.read_text().splitlines()) <= 250
