@@ -61,6 +61,12 @@ def test_tables_are_made_from_the_code(site: Path) -> None:
         assert f"<code>{name}</code>" in config or name in config, name
 
 
+def test_the_archive_is_named_by_its_path_in_the_repository(site: Path) -> None:
+    assert not (site / "archive").exists() and not list((site / "source").rglob("*archive*"))
+    page = (site / "lab.html").read_text()
+    assert "<code>docs/archive/speed.md</code>" in page and 'href="archive/' not in page
+
+
 def test_chinese_pages_say_so_and_lead_to_their_english_ones(site: Path) -> None:
     page = (site / "zh/concepts.html").read_text()
     assert '<html lang="zh"' in page and '<a class="language" href="../concepts.html">English</a>' in page

@@ -26,6 +26,7 @@ from legged_mw.utils.task import load_task
 
 TASK = str(ROOT / "examples/go1_legged_gym.py")
 PAGE = ROOT / "docs/from_legged_gym.md"
+BEFORE_AND_AFTER = ROOT / "docs/legged_gym_config.md"
 DT = 0.02  # [s] a control step
 # legged_gym's, where they are not 0: envs/base/legged_robot_config.py and envs/a1/a1_config.py
 SCALES = {
@@ -346,7 +347,7 @@ def test_mistakes_are_one_clear_line(overrides: dict[str, Any], message: str) ->
 
 def blocks() -> list[str]:
     """The page's Python blocks that are whole config files."""
-    found = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    found = re.findall(r"```python\n(.*?)```", BEFORE_AND_AFTER.read_text(encoding="utf-8"), flags=re.DOTALL)
     return [block for block in found if "TASK = Task(" in block]
 
 

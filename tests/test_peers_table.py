@@ -1,4 +1,4 @@
-"""docs/lab.md's tables of published policies hold the figures of eval/peers.py, and of the policies that ship."""
+"""docs/published_policies.md's tables hold the figures of eval/peers.py, and of the policies that ship."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from legged_mw import ROOT
 from legged_mw.eval.peers import PEERS, Peer
 
-PAGE = (ROOT / "docs/lab.md").read_text()
+PAGE = (ROOT / "docs/published_policies.md").read_text()
 PUSHES = {"go2": "123456", "g1": ("0.5", "1", "1.5", "2", "3")}  # [m/s] those that the exam of the shipped policy asks
 
 
@@ -48,5 +48,5 @@ def test_the_last_line_is_the_policy_that_ships(robot: str) -> None:
     shown = (ROOT / f"resources/policies/{robot}_flat/README.md").read_text()
     numbers = re.findall(r"\d+\.\d+", ours)
     assert len(numbers) >= 8 and [number for number in numbers if number not in shown] == [], (
-        "of docs/lab.md, not of the policy's page"
+        "of docs/published_policies.md, not of the policy's page"
     )

@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 MARK = re.compile(r"<!-- made: (\w+) -->")
 LINK = re.compile(r"(\]\()([^)\s]+)(\))")
+ARCHIVED = re.compile(r"\[([^\]]+)\]\(archive/[^)\s]+\)")  # in the repository alone: the link's text is the path
 FENCE = re.compile(r"(^```.*?^```$|`[^`\n]+`)", re.MULTILINE | re.DOTALL)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".xml": "xml", ".csv": "text", ".yml": "yaml", ".cpp": "cpp"}
 PICTURES = (".png", ".jpg", ".gif", ".svg", ".webp", ".mp4", ".html", ".ipynb")
@@ -94,7 +95,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
     markdown = MARK.sub(lambda found: made(found.group(1)), markdown)
     if source.suffix == ".md" and source.exists():
-        parts = FENCE.split(markdown)
+        parts = FENCE.split(ARCHIVED.sub(r"`\1`", markdown))
         markdown = "".join(part if i % 2 else LINK.sub(relinked, part) for i, part in enumerate(parts))
     return twin(here) + markdown
 

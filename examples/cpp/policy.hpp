@@ -1,5 +1,5 @@
 // An exported policy around its network: observations from a measurement in the contract's order, joint targets from actions.
-// It does what legged_mw/deploy/policy.py and gait.py do, and knows no robot, no clock and no limits.
+// It does what legged_mw/deploy/controller.py does, and knows no robot, no clock and no limits.
 #pragma once
 
 #include <algorithm>
