@@ -14,11 +14,11 @@ from program import run
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot
 
-from legged_mw import ROOT
+from legged_mw import ROOT, programs
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.eval import exam, grading, plots
+from legged_mw.eval import exam, plots
 from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
 from legged_mw.utils.config import ConfigError
@@ -306,7 +306,7 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     )
     assert result.code == 0, result.err
     assert list((tmp_path / "logs/go1_legged_gym").glob("*/model_2.pt"))
-    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])  # the same once more, through an export
+    monkeypatch.setattr(programs, "grade_export", lambda *_: [])  # the same once more, through an export
     monkeypatch.setattr(plots, "sections", lambda *_: [])  # drawn in test_report
     result = run("play", tmp_path, "--task", TASK, "--device", "cpu", "--eval")
     assert result.code == 0 and "survives pushes of 6 m/s" in result.out, result.err

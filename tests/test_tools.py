@@ -23,7 +23,7 @@ from legged_mw.rl import training
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
-from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
+from legged_mw.tools import alongside, compare, completion, doctor, sweep, warm
 from legged_mw.tools.curves import read_run
 from legged_mw.utils import machine
 from legged_mw.utils.cli import one_line_errors
@@ -269,13 +269,13 @@ def test_compare_writes_one_page_that_needs_nothing_else(
 
 
 def test_axes_have_round_numbers() -> None:
-    assert chart.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and chart.ticks(-0.3, 0.4, 4) == pytest.approx(
+    assert compare.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and compare.ticks(-0.3, 0.4, 4) == pytest.approx(
         [-0.4, -0.2, 0, 0.2, 0.4]
     )
-    assert chart.ticks(5.0, 5.0, 4)[0] < 5.0 < chart.ticks(5.0, 5.0, 4)[-1]
-    assert chart.chart("x", "y", [("red", [1.0], [float("nan")])]) == ""
-    assert [chart.short(value) for value in (0.25, 5000.0, 20000.0, 1.5e6)] == ["0.25", "5000", "20k", "1.5M"]
-    assert len(chart.thin([(float(i), 1.0) for i in range(1000)])) <= chart.POINTS
+    assert compare.ticks(5.0, 5.0, 4)[0] < 5.0 < compare.ticks(5.0, 5.0, 4)[-1]
+    assert compare.chart("x", "y", [("red", [1.0], [float("nan")])]) == ""
+    assert [compare.short(value) for value in (0.25, 5000.0, 20000.0, 1.5e6)] == ["0.25", "5000", "20k", "1.5M"]
+    assert len(compare.thin([(float(i), 1.0) for i in range(1000)])) <= compare.POINTS
 
 
 def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) -> None:

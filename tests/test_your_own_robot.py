@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from program import Result, run
 
-from legged_mw import ROOT
-from legged_mw.eval import exam, grading, plots
+from legged_mw import ROOT, programs
+from legged_mw.eval import exam, plots
 from legged_mw.robot import __main__ as robot_program
 from legged_mw.utils.task import load_task
 
@@ -57,7 +57,9 @@ def test_every_command_runs(
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(exam, "SECONDS", 2.1)
-    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])  # the exam on the other engine, in a process of its own
+    monkeypatch.setattr(
+        programs, "grade_export", lambda *_: []
+    )  # the exam on the other engine, in a process of its own
     draw = plots.sections  # one picture of the report is enough here
     monkeypatch.setattr(plots, "sections", lambda *args: [each for each in draw(*args) if each.name == "pushes"])
     said = []
