@@ -807,7 +807,6 @@ def load_robot(
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
     asset, scale = cfg.asset, cfg.control.action_scale
-    stiffness, damping = motor_gains(cfg, law)
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     try:
@@ -817,8 +816,7 @@ def load_robot(
             ground=Ground(
                 cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope
             ),
-            stiffness=stiffness,
-            damping=damping,
+            **motor_gains(cfg, law),
             colliders=asset.colliders,
             self_collisions=asset.self_collisions,
             contact_geoms=contact_geoms,
