@@ -25,9 +25,7 @@ class BaseTask(VecEnv):
     device: str
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
-    not_remembered = (
-        ""  # the step writes this beside its buffers, so a run cannot resume exactly; check/'s guard finds it
-    )
+    not_remembered = ""  # why no run can resume exactly: what the step writes beside its buffers, by check/'s guard
 
     def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
         self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager

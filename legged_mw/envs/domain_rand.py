@@ -29,9 +29,7 @@ class Kind(NamedTuple):
     """What one range of the config means."""
 
     per: str  # numbers a world: "world" one, "axis" three, "joint" D, "link" 1 + D (the root's, then the joints')
-    neutral: (
-        float | None
-    )  # the number that changes nothing; None: it replaces the field's first one, in the ground's geoms
+    neutral: float | None  # changes nothing; None: the number replaces the field's first one in the ground's geoms
     mirror: str  # its mirror image, a kind of envs/mirror.py
     fields: tuple[str, ...] = ()  # of the model, that it writes; for FACTORS see motors.factor_fields
     whole: bool = False  # whole numbers, both ends included
@@ -221,7 +219,7 @@ def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:
 
 
 def _links(robot: RobotModel) -> Tensor:
-    """The column of "link_mass" of each body: 0 the root's, 1 + j of what joint j moves, 1 + D outside of the robot."""
+    """The column of "link_mass" of each body: 0 the root's, 1 + j joint j's, 1 + D outside of the robot."""
     model = robot.physics
     weld = {int(model.body_weldid[robot.id("body", robot.root)]): 0}
     for column, name in enumerate(robot.joint_names, start=1):

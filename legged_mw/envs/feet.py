@@ -63,13 +63,9 @@ class GaitClock:
         self._share = dt / cfg.period  # of the period in a control step
         self._shift = torch.tensor(self.offsets, device=device)  # (F,)
         self.phase = torch.zeros(num_envs, device=device)  # (N,) share of the period, as last observed
-        self.running = torch.zeros(
-            num_envs, dtype=torch.bool, device=device
-        )  # (N,) the last observed command is to move
+        self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) last observed: commanded to move
         self.foot_phase = torch.zeros(num_envs, len(feet), device=device)  # (N, F) from 0 to 1
-        self.row = torch.zeros(
-            num_envs, 2 * len(feet), device=device
-        )  # sine of each foot's phase, then cosine; 0 at rest
+        self.row = torch.zeros(num_envs, 2 * len(feet), device=device)  # sines of the phases, then cosines; 0 at rest
 
     def tick(self) -> None:
         """Advance the running clocks by a control step."""

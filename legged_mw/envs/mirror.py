@@ -88,9 +88,7 @@ def robot_blocks(partners: Partners) -> dict[str, Block]:
         "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # body frame; shifted by the row "base_ang_vel" beside it
         "joint": joints,  # a number a joint
         "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # likewise, whatever the axis's direction
-        "link": Block(
-            [0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))
-        ),  # the root's, then the joints'
+        "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # root's, then joints'
     }
 
 

@@ -57,11 +57,10 @@ def motor_gains(cfg: RobotTaskCfg, law: str) -> dict[str, Mapping[str, float]]:
     return {"stiffness": stiffness, "damping": control.damping or none}
 
 
-def motor_curves(cfg: RobotTaskCfg, law: str) -> dict[str, Mapping[str, float]]:
+def motor_curves(cfg: RobotTaskCfg, law: str) -> Mapping[str, Mapping[str, float]]:
     """The tables of the torque-speed curve; none without a curve."""
-    control = cfg.control
-    tables = {"stall_torque": control.stall_torque, "no_load_speed": control.no_load_speed, "gear": control.gear}
-    return tables if has_curve(cfg, law) else {}
+    tables = ("stall_torque", "no_load_speed", "gear") if has_curve(cfg, law) else ()
+    return {name: getattr(cfg.control, name) for name in tables}
 
 
 def factor_fields(cfg: RobotTaskCfg, law: str) -> dict[str, tuple[str, ...]]:

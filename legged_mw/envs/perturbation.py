@@ -51,9 +51,8 @@ class Perturbation:
             self.growth.fill_(float(np.interp(done, self.cfg.growth, [0.0, 1.0])))
 
     def update_level(self, mask: Tensor, survived: Tensor) -> None:
-        """Move levels towards the share ``survived`` (N,) of an episode, where ``mask`` is true and it is >= 0."""
-        level = torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate)
-        assign(self.kick_level, mask & (survived >= 0.0), level)
+        """Move levels towards the share ``survived`` (N,) of an episode, where ``mask`` (N,) is true."""
+        assign(self.kick_level, mask, torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate))
 
     def statistics(self) -> dict[str, Tensor]:
         """With a curriculum the kicks' mean level: (2,) a sum and what to divide it by."""
