@@ -255,7 +255,7 @@ class UnitreeHandstandCfg(HandstandCfg):
 class UnitreeFootstandCfg(HandstandCfg):
     """A footstand of such a quadruped: it stands on the rear legs.
 
-    In [P] contacts of the front legs end an episode; here, as in a handstand, contacts of the legs that stand.
+    In [P] contacts of the front legs end an episode; here, as in a handstand, those of the standing legs (but feet).
     """
 
     class asset(HandstandCfg.asset):

@@ -1,7 +1,6 @@
 """Unitree G1, a humanoid of 29 joints: for any task, walking, tracking. Masses, motors and ranges are in g1.xml.
 
-Sources: [U] unitree_rl_gym; [M] mjlab, with gains from each rotor's inertia, at 10 Hz and a damping ratio of 2;
-[B] BeyondMimic; [ours].
+Sources: [U] unitree_rl_gym; [M] mjlab: gains from rotor inertia, 10 Hz, damping ratio 2; [B] BeyondMimic; [ours].
 """
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
@@ -14,10 +13,8 @@ class G1(RobotTaskCfg):
         file, imu_site = "resources/robots/g1/g1.xml", "imu_in_pelvis"
 
     class init_state(RobotTaskCfg.init_state):
-        default_joint_angles = {  # [rad] [U]
-            **{"": 0.0, "hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2, "elbow": 0.8, "shoulder_pitch": 0.2},
-            **{"left_shoulder_roll": 0.2, "right_shoulder_roll": -0.2},
-        }
+        default_joint_angles = {"": 0.0, "hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2, "elbow": 0.8,  # [rad] [U]
+                        "shoulder_pitch": 0.2, "left_shoulder_roll": 0.2, "right_shoulder_roll": -0.2}  # fmt: skip
 
     class control(RobotTaskCfg.control):  # [M], by motor: 5020; 4010; 7520-14; 7520-22; two 5020
         stiffness = {"": 14.25, "wrist_pitch": 16.78, "wrist_yaw": 16.78, "hip": 40.18, "waist_yaw": 40.18,  # [N m/rad]

@@ -129,7 +129,9 @@ class Actuators:
         self.encoder_offset = drawn.get("encoder_offset")  # (N, D) [rad], measured minus true angle
         self._offset = self.encoder_offset if by_angle else None
         self._start: Tensor | float = default if by_angle else 0.0  # targets of a new episode
-        self._delay = make_delay(cfg, "action_delay", drawn, len(scale), start=0.0)
+        self._delay: Delay | None = None
+        if "action_delay" in drawn:
+            self._delay = Delay(cfg, "action_delay", drawn["action_delay"], len(scale), start=0.0)
         self._late = SubstepDelay(cfg, drawn["delay_ms"], len(scale)) if "delay_ms" in drawn else None
         # (N, D) sent to the motors: targets minus encoder offsets, torques, or under OWN actions
         self._sent = sim.ctrl
@@ -266,9 +268,12 @@ class Delay:
 
     written = ("past", "_new")
 
-    def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
-        """Each call reads ``steps`` (N, 1). ``start``: the value before an episode; None: the episode's first one."""
-        self.steps, self.start = steps, start
+    def __init__(self, cfg: RobotTaskCfg, name: str, steps: Tensor, width: int, start: float | None = None) -> None:
+        """Each call reads ``steps`` (N, 1), drawn by ``domain_rand.<name>``. Before an episode the value was ``start``;
+        None: the episode's first one.
+        """
+        self.steps, self.start, longest = steps, start, int(getattr(cfg.domain_rand, name)[1])
+        _require_memory(cfg, name, steps, longest + 1, width)
         self.past = torch.zeros(len(steps), longest + 1, width, device=steps.device)  # newest first
         self._new = torch.ones(len(steps), dtype=torch.bool, device=steps.device)
 
@@ -325,17 +330,6 @@ class SubstepDelay:
 def round_delay(delay: Any, step_ms: float) -> Any:
     """``delay`` [ms], a number or a tensor, rounded to whole simulation steps, a half up."""
     return (delay / step_ms + 0.5) // 1.0 * step_ms
-
-
-def make_delay(
-    cfg: RobotTaskCfg, name: str, drawn: Mapping[str, Tensor], width: int, start: float | None = None
-) -> Delay | None:
-    """The delay line of ``action_delay`` or ``observation_delay`` [control steps]; None if the config has none."""
-    if name not in drawn:
-        return None
-    longest = int(getattr(cfg.domain_rand, name)[1])
-    _require_memory(cfg, name, drawn[name], longest + 1, width)
-    return Delay(drawn[name], longest, width, start)
 
 
 def _require_memory(cfg: RobotTaskCfg, name: str, delays: Tensor, frames: float, width: int) -> None:

@@ -78,9 +78,9 @@ class Observations:
         noise_level: float,
         num_envs: int,
         device: str,
-        make_delay: Callable[[int], Delay | None],
+        make_delay: Callable[[int], Delay] | None = None,
     ) -> None:
-        """``table`` is that of ``observation_rows``; ``make_delay(width)`` makes a group's delay, or returns None."""
+        """``table`` is that of ``observation_rows``; ``make_delay(width)`` makes the delay of measured rows."""
         self.groups: dict[str, list[Row]] = {}
         self.buffers: dict[str, Tensor] = {}
         self._parts: dict[str, _Group] = {}
@@ -91,7 +91,7 @@ class Observations:
             frames = {row.name: cfg.history.get(f"{group}.{row.name}", cfg.history.get(group, 1)) for row in rows}
             self.groups[group] = [row._replace(history=frames[row.name]) for row in rows]
             part = _Group(group, self.groups[group], noise_level, num_envs, device)
-            if any(row.measured for row in rows):
+            if make_delay and any(row.measured for row in rows):
                 part.delay = make_delay(part.frame.shape[1])
             self._parts[group], self.buffers[group] = part, part.buffer
 

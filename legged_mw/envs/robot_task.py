@@ -28,7 +28,7 @@ from torch import Tensor
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.domain_rand import DomainRand, check_draws, world_fields
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
-from legged_mw.envs.motors import Actuators, make_delay, motor_curves, motor_drive, motor_gains, own_law
+from legged_mw.envs.motors import Actuators, Delay, motor_curves, motor_drive, motor_gains, own_law
 from legged_mw.envs.observations import Observations, Row, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -287,7 +287,8 @@ class RobotTask(BaseTask):
         if hasattr(self, "_observation_rows"):
             raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
         rows, cfg = checked_rows(self.observation_rows, self.num_envs), self.cfg
-        delay = partial(make_delay, cfg, "observation_delay", self.domain_rand.values)
+        late = self.domain_rand.values.get("observation_delay")
+        delay = None if late is None else partial(Delay, cfg, "observation_delay", late)
         made = Observations(rows, cfg.observations, cfg.noise.level, self.num_envs, self.device, delay)
         self.observations = self.remember(made)
         self.obs_buf = self.observations.buffers

@@ -35,7 +35,7 @@ class MotionTrackingCfg(RobotTaskCfg):
         hold_s: Duration = 1.0  # the last frame is held so long, then the episode times out [s] [ours: as deploy]
         bin_s: Seconds = 1.0  # length of a bin [s]
         failure_rate: PositiveShare = 0.001  # share of a step in the moving average of the failures in each bin
-        # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, which exceed it]
+        # share of the episodes that begin in any bin [-] [ours: B's code adds it to failures, where it is negligible]
         uniform: PositiveShare = 0.1
         # offsets from the reference as an episode begins, each U(-range, range): x, y, z [m]
         start_pos: NonNegativeVector = [0.05, 0.05, 0.01]
