@@ -1,8 +1,9 @@
-"""What tasks of different robots share: numbers for a real robot that walks, gets up, stands on two of four legs, follows a motion.
+"""Presets that tasks of different robots share: walking, getting up, standing on two of four legs, following a motion.
 
-Config classes only; a robot's own names and numbers are in configs/robots/. Sources: [I] Isaac Lab's G1 task, [M] mjlab's velocity
-task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks, [U] unitree_rl_gym's G1, [H] HoST, a G1 with 23 joints,
-[B] BeyondMimic; [ours] is measured: docs/lab.md.
+They are meant for a real robot. A robot's own names and numbers are in configs/robots/.
+
+Sources: [I] Isaac Lab's G1, [M] mjlab's velocity task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks,
+[U] unitree_rl_gym's G1, [H] HoST, a G1 with 23 joints, [B] BeyondMimic; [ours] is measured: docs/lab.md.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ class SimToRealCfg(LeggedRobotCfg):
         num_envs = 8192
 
     class observations(LeggedRobotCfg.observations):
-        leave_out = {"state": ["base_lin_vel"]}  # no sensor gives it; the critic knows it
+        leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it; the critic sees it
 
     class commands(LeggedRobotCfg.commands):
-        curriculum = True  # [ours: over its whole range at once a Go2 learns to stand first, and to walk after minutes]
+        curriculum = True  # [ours: with the whole range at once a Go2 only stands for minutes before it walks]
         curriculum_step = 0.2  # [ours]
 
     class rewards(LeggedRobotCfg.rewards):
-        tracking_sigma, tracking_sigma_end = 0.3, 0.05  # [ours: wide to find a walk in, narrow to follow exactly]
+        tracking_sigma, tracking_sigma_end = 0.3, 0.05  # [ours: wide to find a gait, narrow to track exactly]
 
         class scales(LeggedRobotCfg.rewards.scales):
             tracking_lin_vel = 2.0  # [ours]
@@ -43,7 +44,7 @@ class SimToRealCfg(LeggedRobotCfg):
         damping = [0.9, 1.1]  # [ours]
         strength = [0.9, 1.1]  # [ours]
         encoder_offset = [-0.015, 0.015]  # [rad] [M]
-        observe = True  # the critic knows
+        observe = True  # for the critic
 
     class perturbation(LeggedRobotCfg.perturbation):
         kick = True
@@ -54,7 +55,7 @@ class SimToRealCfg(LeggedRobotCfg):
 
 
 class SimToRealCfgPPO(LeggedRobotCfgPPO):
-    """The learner of such a task."""
+    """The learner of SimToRealCfg."""
 
     class runner(LeggedRobotCfgPPO.runner):
         num_steps_per_env = 12  # [ours]
@@ -62,7 +63,7 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
     class actor(LeggedRobotCfgPPO.actor):
         class distribution_cfg(LeggedRobotCfgPPO.actor.distribution_cfg):
-            init_std = 1.0  # [ours: at 0.6 a Go2's soft servos do not find a step]
+            init_std = 1.0  # [ours: at 0.6 a Go2 with its soft servos does not learn to step]
 
     class algorithm(LeggedRobotCfgPPO.algorithm):
         gamma = 0.97  # [ours]
@@ -78,10 +79,7 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
 
 class SimToRealRoughCfg(SimToRealCfg):
-    """Such a robot, of a Go2's size, on rough ground that it does not see: the first parent of a task whose second is the flat one.
-
-    [L] legged_gym; [ours] docs/terrain.md.
-    """
+    """A quadruped of a Go2's size on rough ground that it does not see. [L] legged_gym; [ours] docs/terrain.md."""
 
     class commands(SimToRealCfg.commands):
         curriculum = False  # [ours: the ground's is enough]
@@ -95,8 +93,7 @@ class SimToRealRoughCfg(SimToRealCfg):
         }
 
     class termination(SimToRealCfg.termination):
-        # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
-        min_base_height = 0.12
+        min_base_height = 0.12  # [m] [ours: only feet touch the ground, so a trunk could sink into a step unpunished]
 
     class rewards(SimToRealCfg.rewards):
         tracking_sigma, tracking_sigma_end = 0.25, 0.0  # [P]
@@ -112,7 +109,7 @@ class SimToRealRoughCfg(SimToRealCfg):
 
 
 class SimToRealRoughCfgPPO(SimToRealCfgPPO):
-    """Its learner on rough ground: longer pieces of walks, and a longer sight."""
+    """Its learner on rough ground: longer rollouts and a longer horizon."""
 
     class runner(SimToRealCfgPPO.runner):
         num_steps_per_env = 24  # [legged_gym]
@@ -124,7 +121,7 @@ class SimToRealRoughCfgPPO(SimToRealCfgPPO):
 
 
 class BipedCfg(SimToRealCfg):
-    """Such a robot with two legs."""
+    """A biped that walks by command and does not know its velocity."""
 
     class gait(SimToRealCfg.gait):
         period = 0.8  # [s] [U]
@@ -174,11 +171,11 @@ class BipedCfgPPO(SimToRealCfgPPO):
         num_steps_per_env, max_iterations = 16, 3000  # [ours]
 
     class algorithm(SimToRealCfgPPO.algorithm):
-        desired_kl = 0.02  # [ours: of 29 joints together; at 0.01 the rate falls to 1e-5]
+        desired_kl = 0.02  # [ours: over 29 joints; at 0.01 the learning rate falls to 1e-5]
 
 
 class BipedRoughCfg(BipedCfg):
-    """Such a robot, of a G1's size, on rough ground that it does not see."""
+    """A biped of a G1's size on rough ground that it does not see."""
 
     class terrain(BipedCfg.terrain):
         mesh_type = "heightfield"
@@ -206,22 +203,22 @@ class BipedRoughCfgPPO(BipedCfgPPO):
 
     class anneal(BipedCfgPPO.anneal):
         entropy_coef = 0.0001  # [ours]
-        desired_kl = 0.0  # [ours: stays; with less the rate falls to 1e-5]
+        desired_kl = 0.0  # [ours: not annealed; if it shrinks, the learning rate falls to 1e-5]
 
 
 class BipedGetupCfg(GetupCfg):
-    """Getting up on two legs, of a G1's size."""
+    """Getting up, for a biped of a G1's size."""
 
     class env(GetupCfg.env):
         num_envs = 4096
         episode_length_s = 10.0  # [s] [H]
 
     class falls(GetupCfg.falls):
-        seconds = 1.5  # [s] [ours: it falls from higher]
+        seconds = 1.5  # [s] [ours: it falls from a greater height]
         pull = 0.8  # of its weight [H 0.6]
 
     class control(GetupCfg.control):
-        action_origin = "default"  # [ours: its servos alone stand it up in the pull; docs/skills.md]
+        action_origin = "default"  # [ours: with the pull its servos alone stand it up; docs/skills.md]
 
     class rewards(GetupCfg.rewards):
         class scales(GetupCfg.rewards.scales):
@@ -238,12 +235,12 @@ class BipedGetupCfgPPO(GetupCfgPPO):
         max_iterations = 4000
 
     class algorithm(GetupCfgPPO.algorithm):
-        gamma = 0.99  # [ours: it takes seconds]
-        desired_kl, entropy_coef = 0.02, 0.005  # [ours: of 29 joints together], [M]
+        gamma = 0.99  # [ours: getting up takes seconds]
+        desired_kl, entropy_coef = 0.02, 0.005  # [ours: over 29 joints], [M]
 
 
 class UnitreeHandstandCfg(HandstandCfg):
-    """A handstand on four legs that are called FR, FL, RR and RL: the front ones stand."""
+    """A handstand of a quadruped with legs FR, FL, RR, RL: it stands on the front ones."""
 
     class asset(HandstandCfg.asset):
         penalize_contacts_on = ["RR*", "RL*"]
@@ -256,7 +253,10 @@ class UnitreeHandstandCfg(HandstandCfg):
 
 
 class UnitreeFootstandCfg(HandstandCfg):
-    """A footstand of such a robot: the rear ones stand. [P] ends on the front legs' geoms; here, as in a handstand, on those that stand."""
+    """A footstand of such a quadruped: it stands on the rear legs.
+
+    In [P] contacts of the front legs end an episode; here, as in a handstand, those of the standing legs (but feet).
+    """
 
     class asset(HandstandCfg.asset):
         penalize_contacts_on = ["FR*", "FL*"]
@@ -278,7 +278,7 @@ class TrackingCfg(MotionTrackingCfg):
         leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor gives them [B, without state estimation]
 
     class normalization(MotionTrackingCfg.normalization):
-        clip_actions = 10.0  # [ours: B has no bound, and a squat's knees are four scales from the default pose]
+        clip_actions = 10.0  # [ours: B has no bound; in a squat the knees are 4 action scales from the default pose]
 
     class domain_rand(MotionTrackingCfg.domain_rand):
         enable = True
@@ -295,14 +295,13 @@ class TrackingCfgPPO(RobotTaskCfgPPO):
     """The learner of one clip, of a humanoid."""
 
     class algorithm(RobotTaskCfgPPO.algorithm):
-        desired_kl = 0.02  # [ours: of 29 joints together, as a walking G1's]
+        desired_kl = 0.02  # [ours: over 29 joints, as a walking G1's]
 
     class runner(RobotTaskCfgPPO.runner):
         max_iterations = 1400  # seven minutes on an H200
 
     class actor(RobotTaskCfgPPO.actor):
-        hidden_dims = [224, 128, 64]  # [ours: one clip is learned by less than B's 512, 256, 128]
+        hidden_dims = [224, 128, 64]  # [ours: one clip needs less than B's 512, 256, 128]
 
         class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            # [ours: with the 1.0 of B action_rate outweighs all of tracking at first, and it learns to fall soon]
-            init_std = 0.4
+            init_std = 0.4  # [ours: with B's 1.0 action_rate at first outweighs tracking, and it learns to fall soon]

@@ -28,7 +28,7 @@ class Go1FlatCfg(WalkingGo1):
         kick = True  # [ours: trained without, a quarter of pushes of 2 m/s topple it; docs/lab.md]
         velocity = [0.0, 8.0]  # [m/s] [ours: with up to 3, an eighth still do]
 
-    class exam(WalkingGo1.exam):  # [ours: what P's policy was graded with]
+    class exam(WalkingGo1.exam):  # [ours: as for P's policy]
         push_speeds = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]  # [m/s]
         push_vx = 0.8  # [m/s]
         transport_vx = 1.0  # [m/s]
@@ -53,16 +53,16 @@ class Go1FlatCfgPPO(LeggedRobotCfgPPO):
 
 
 class Go1FlatTaskCfgPPO(Go1FlatCfgPPO):
-    """On a CPU this task changes rewards and commands too; a task of your own subclasses Go1FlatCfgPPO, which does not."""
+    """On a CPU this task also changes rewards and commands. In your own task subclass Go1FlatCfgPPO, which does not."""
 
-    class cpu(Go1FlatCfgPPO.cpu):  # [ours: five of five seeds walk; given 8 minutes on two cores, three; docs/lab.md]
+    class cpu(Go1FlatCfgPPO.cpu):  # [ours: five of five seeds walk; within 8 minutes on two cores, three; docs/lab.md]
         desired_kl = 0.03
         max_iterations = 1200
         overrides = {
-            "commands.keep_probability": [0.6, 0.25, 0.75],  # to turn on the spot is rare otherwise, and learned last
+            "commands.keep_probability": [0.6, 0.25, 0.75],  # else turning on the spot is rare, and learned last
             "commands.curriculum": True,
             "commands.curriculum_step": 0.2,
-            "perturbation.growth": [0.15, 0.4],  # weak kicks let it learn to walk, strong ones to survive pushes
+            "perturbation.growth": [0.15, 0.4],  # weak kicks while it learns to walk, then strong ones
             "rewards.tracking_sigma": 0.35,
             "rewards.tracking_sigma_end": 0.15,
             "rewards.scales.tracking_ang_vel": 1.5,

@@ -1,4 +1,4 @@
-"""go1_flat in a minute and a half on one H200: less energy, kicks by survival, a narrower sigma at the end, and bfloat16."""
+"""go1_flat in a minute and a half on one H200: less energy, kicks by survival, a narrower final sigma, bfloat16."""
 
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -8,7 +8,7 @@ from legged_mw.utils.task import Task
 # all [ours]: four of five seeds beat the peer after 54 to 74 s, one at its end; docs/lab.md
 class Go1FlatFastCfg(Go1FlatCfg):
     class commands(Go1FlatCfg.commands):
-        keep_probability = [0.7, 0.25, 0.5]  # to stand and to turn on the spot are asked for more often
+        keep_probability = [0.7, 0.25, 0.5]  # more commands to stand and to turn on the spot
 
     class rewards(Go1FlatCfg.rewards):
         tracking_sigma_end = 0.12

@@ -1,6 +1,6 @@
-"""Unitree Go1 follows a joystick over slopes, stairs and blocks, and does not see them; randomized worlds, kicks and pushes.
+"""Unitree Go1 follows a joystick over slopes, stairs and blocks that it does not see; random worlds, kicks, pushes.
 
-Sources: [P] MuJoCo Playground's rough task for this robot; [L] legged_gym's terrain and curriculum; [ours] docs/terrain.md.
+Sources: [P] MuJoCo Playground's rough task for Go1; [L] legged_gym's terrain and curriculum; [ours] docs/terrain.md.
 """
 
 from configs.base import SimToRealRoughCfg
@@ -11,7 +11,11 @@ from legged_mw.utils.task import Task
 
 
 class Go1RoughCfg(Go1FlatDrCfg):
-    terrain, termination = SimToRealRoughCfg.terrain, SimToRealRoughCfg.termination
+    class terrain(SimToRealRoughCfg.terrain):
+        pass
+
+    class termination(SimToRealRoughCfg.termination):
+        pass
 
     class sim(Go1FlatDrCfg.sim):
         njmax = 56  # 12 friction, 12 limits, 4 a contact, two contacts a foot
@@ -27,7 +31,7 @@ class Go1RoughCfg(Go1FlatDrCfg):
             feet_clearance = -1.0  # [P -2.0] [ours]
 
     class perturbation(Go1FlatDrCfg.perturbation):
-        curriculum = True  # [ours: it has enough to learn at the start]
+        curriculum = True  # [ours: weak kicks first, as the ground is hard enough]
 
 
 class Go1RoughCfgPPO(Go1FlatCfgPPO):

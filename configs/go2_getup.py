@@ -7,7 +7,7 @@ from legged_mw.utils.task import Task
 
 class Go2GetupCfg(Go2, GetupCfg):
     class control(Go2.control, GetupCfg.control):
-        action_scale = 0.9  # [rad] [ours: as much torque as Go1's 0.5; at 2 nearly what the knees have]
+        action_scale = 0.9  # [rad] [ours: as much torque as Go1's 0.5; at 2 nearly the knees' limit]
 
 
 TASK = Task(Getup, Go2GetupCfg, GetupCfgPPO)

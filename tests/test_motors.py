@@ -22,6 +22,7 @@ from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motors import SubstepDelay
+from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.snapshot import put_snapshot, take_snapshot
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import export
@@ -123,7 +124,9 @@ def test_what_a_law_does_not_have_is_not_drawn() -> None:
 
 def test_a_delay_of_7_ms_by_hand() -> None:
     """In steps of 4 ms the nearest is 8 ms: the first two of five steps still use what was sent before."""
-    delay = SubstepDelay(torch.tensor([[0.0], [8.0], [32.0]]), 4.0, 32.0, 5, 1)
+    cfg = RobotTaskCfg()
+    cfg.domain_rand.delay_ms = [0.0, 32.0]
+    delay = SubstepDelay(cfg, torch.tensor([[0.0], [8.0], [32.0]]), 1)
     delay.restart(torch.ones(3, dtype=torch.bool), torch.full((3, 1), -1.0))
     arriving = []
     for sent in (0.0, 1.0, 2.0):

@@ -35,7 +35,7 @@ WORDS = {  # names that say less than words do
         "(error / -tracking_sigma)": "(-error / tracking_sigma)",
         "exp(Σ (foot_height - wanted)² / -": "exp(-Σ (foot_height - wanted)² / ",
     },
-    "quat_rotate(sim.xquat[foot_bodies], foot_up.expand(len(foot_contact), -1, -1))": "the foot's own vertical in the world's frame",
+    "quat_rotate(sim.xquat[foot_bodies], foot_up)": "the foot's own vertical in the world's frame",
 }
 WRAPPED = {"abs": "|{}|", "norm": "‖{}‖", "sqrt": "√({})", "square": "({})²"}
 REDUCED = {"sum": "Σ", "mean": "mean", "amax": "max", "amin": "min", "any": "any", "all": "all", "var": "var"}

@@ -1,1 +1,1 @@
-"""Robots, one a file: what any task of the robot shares. A task names a robot first and what it does second."""
+"""Robots, one a file: the config that all tasks of a robot share. A task's bases are a robot, then a skill."""

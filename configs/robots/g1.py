@@ -1,6 +1,6 @@
-"""Unitree G1, a humanoid of 29 joints: in any task, and what walking and tracking add. Masses, motors and ranges are in g1.xml.
+"""Unitree G1, a humanoid of 29 joints: for any task, walking, tracking. Masses, motors and ranges are in g1.xml.
 
-Sources: [U] unitree_rl_gym; [M] mjlab, with gains from each rotor's inertia, at 10 Hz and a damping ratio of 2; [B] BeyondMimic; [ours].
+Sources: [U] unitree_rl_gym; [M] mjlab: gains from rotor inertia, 10 Hz, damping ratio 2; [B] BeyondMimic; [ours].
 """
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
@@ -14,15 +14,16 @@ class G1(RobotTaskCfg):
 
     class init_state(RobotTaskCfg.init_state):
         default_joint_angles = {"": 0.0, "hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2, "elbow": 0.8,  # [rad] [U]
-                                "shoulder_pitch": 0.2, "left_shoulder_roll": 0.2, "right_shoulder_roll": -0.2}  # fmt: skip
+                        "shoulder_pitch": 0.2, "left_shoulder_roll": 0.2, "right_shoulder_roll": -0.2}  # fmt: skip
 
     class control(RobotTaskCfg.control):  # [M], by motor: 5020; 4010; 7520-14; 7520-22; two 5020
         stiffness = {"": 14.25, "wrist_pitch": 16.78, "wrist_yaw": 16.78, "hip": 40.18, "waist_yaw": 40.18,  # [N m/rad]
                      "hip_roll": 99.1, "knee": 99.1, "ankle": 28.5, "waist": 28.5}  # fmt: skip
         damping = {"": 0.907, "wrist_pitch": 1.07, "wrist_yaw": 1.07, "hip": 2.56, "waist_yaw": 2.56,  # [N m s/rad]
                    "hip_roll": 6.31, "knee": 6.31, "ankle": 1.81, "waist": 1.81}  # fmt: skip
+        # 4 times this, times the stiffness, is the motors' highest torque
         action_scale = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "waist_yaw": 0.55,  # [rad]
-                        "hip_roll": 0.35, "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # 4: the motors' torque  # fmt: skip
+                        "hip_roll": 0.35, "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # fmt: skip
         decimation = 4
 
     class sim(RobotTaskCfg.sim):

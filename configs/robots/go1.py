@@ -1,4 +1,4 @@
-"""Unitree Go1, four legs of 12 joints: in any task, and what walking adds. Masses, motors and ranges are in go1.xml.
+"""Unitree Go1, four legs, 12 joints: for any task, and for walking. Masses, motors and ranges are in go1.xml.
 
 Source: [P] MuJoCo Playground's tasks for this robot.
 """
@@ -11,7 +11,7 @@ class Go1(RobotTaskCfg):
     class asset(RobotTaskCfg.asset):
         file = "resources/robots/go1/go1.xml"
         imu_site = "imu"
-        # Unitree's go1.urdf has 30.1 for all, at 23.7 N m; the calf's 35.55 N m are behind a lever of 1.5, which its speed pays for
+        # Unitree's go1.urdf has 30.1 for all, at 23.7 N m; a lever of 1.5 gives the calf 35.55 N m and less speed
         joint_speed_limits = {"hip": 30.1, "thigh": 30.1, "calf": 20.06}  # [rad/s]
 
     class init_state(RobotTaskCfg.init_state):

@@ -1,4 +1,4 @@
-"""Unitree Go2, four legs of 12 joints: in any task, and what walking adds. Masses, motors and ranges are in go2.xml.
+"""Unitree Go2, four legs, 12 joints: for any task, and for walking. Masses, motors and ranges are in go2.xml.
 
 Sources: [U] Unitree's own training configs for this robot; [P] MuJoCo Playground's Go1; [ours] docs/lab.md.
 """
@@ -33,7 +33,7 @@ class WalkingGo2(Go2, LeggedRobotCfg):
         action_scale = 0.25  # [rad] [U]
 
     class normalization(LeggedRobotCfg.normalization):
-        clip_actions = 5.0  # [ours: 25 N m, what the motors have]
+        clip_actions = 5.0  # [ours: 25 N m, the motors' limit]
 
     class rewards(LeggedRobotCfg.rewards):
         pose_weights = {"hip": 1.0, "thigh": 1.0, "calf": 0.1}  # [P]

@@ -18,15 +18,14 @@ Kept = TypeVar("Kept")
 class BaseTask(VecEnv):
     """Holds the buffers that cross the border of the recorded step and runs it.
 
-    Inside the step every tensor is fixed and written in place. The learner keeps references across steps, so
-    all that ``step`` and ``reset`` hand out is a copy, and all that is handed in is copied.
+    Inside the step every tensor is fixed and written in place. The learner keeps references across steps, so ``step``
+    and ``reset`` return copies and copy their arguments.
     """
 
     device: str
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
-    # what the step writes and no buffer is, in words: the guard of check/ finds it; '' if there is none
-    not_remembered = ""
+    not_remembered = ""  # why no run can resume exactly: what the step writes beside its buffers, by check/'s guard
 
     def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
         self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager
@@ -39,16 +38,16 @@ class BaseTask(VecEnv):
         self._graph = StepGraph(self._step, device, eager)
 
     def buffer(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
-        """Zeros (N, *shape) for the step to write in place; a resumed run has them as they were."""
+        """Zeros (N, *shape) for the step to write in place; a resumed run restores them."""
         return self.remember(torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device))
 
     def remember(self, kept: Kept) -> Kept:
-        """The same for a tensor of any shape, several in a list or dict, or an object that names its own in ``written``."""
+        """Register a tensor, a list or dict of them, or an object that lists its own in ``written``, for resuming."""
         self._remembered.append(kept)
         return kept
 
     def remembered(self) -> dict[str, Tensor]:
-        """All that was remembered, by the name of its attribute."""
+        """All registered tensors, by the names of their attributes."""
         names = {id(value): name for name, value in reversed(vars(self).items())}
         found: dict[str, Tensor] = {}
         for place, kept in enumerate(self._remembered):
@@ -66,21 +65,19 @@ class BaseTask(VecEnv):
 
     def get_observations(self) -> TensorDict:
         """Copies of the observation groups, each (N, size)."""
-        return TensorDict(
-            {name: obs.clone() for name, obs in self.obs_buf.items()}, batch_size=[self.num_envs], device=self.device
-        )
+        copies = {name: obs.clone() for name, obs in self.obs_buf.items()}
+        return TensorDict(copies, batch_size=[self.num_envs], device=self.device)
 
     @torch.no_grad()  # actions that carry gradients must not make the fixed buffers carry them
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
-        """One control step with ``actions`` (N, A); returns copies of observations, reward (N,), done (N,) and time outs.
+        """One control step with ``actions`` (N, A). Returns copies of observations, reward (N,), done (N,), time outs.
 
-        An environment whose episode ended is already reset: its observation is the first of the next episode.
+        Where done is true, the environment is already reset: its observation is the first of the next episode.
         """
         if actions.shape != self.actions.shape:
-            raise ValueError(
-                f"actions must be {tuple(self.actions.shape)} (environments, joints); got {tuple(actions.shape)}"
-            )
-        with torch.inference_mode():  # the fixed buffers stay ordinary tensors; what lives for a moment is cheaper so
+            wanted, got = tuple(self.actions.shape), tuple(actions.shape)
+            raise ValueError(f"actions must be {wanted} (environments, joints); got {got}")
+        with torch.inference_mode():  # cheaper for temporaries; the fixed buffers stay ordinary tensors
             self.actions.copy_(actions)
             self._graph()
         extras = {"time_outs": self.time_out_buf.clone()}
@@ -93,7 +90,7 @@ class BaseTask(VecEnv):
         return self.get_observations()
 
     def fuse(self, steps: int) -> None:
-        """Make the step faster where legged_mw/fast is there and that pays over so many ``steps``; else it stays as it is."""
+        """Compile the step with legged_mw/fast, if the package exists and that pays over so many ``steps``."""
         if fusion := fast("step_compiler"):
             fusion.fuse(self, steps)
 
@@ -106,7 +103,7 @@ class BaseTask(VecEnv):
 
 
 def _tensors(name: str, kept: Any) -> dict[str, Tensor]:
-    """The tensors of what was remembered as ``name``."""
+    """The tensors of the registered ``kept``, called ``name``."""
     if isinstance(kept, Tensor):
         return {name: kept}
     if isinstance(kept, dict | list | tuple):

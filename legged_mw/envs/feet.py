@@ -1,9 +1,9 @@
-"""Feet: their contacts with the ground, from what the simulator senses, and the gait clock.
+"""Feet: their contacts with the ground, and the gait clock.
 
-The clock says where each foot is in its step, as a policy sees it and as rewards want it. Period and offsets are the config's.
-A world's phase runs from 0 to 1 in a period. Each foot's phase is that plus its offset. A foot stands in the first share of
-its phase (``gait.stance``) and swings in the rest. The clock rests at 0 while the robot is told to stand, and runs from 0 when
-it is told to move. ``legged_mw.deploy.controller`` keeps the same clock.
+The clock says where each foot is in its step, for the policy and for rewards. A world's phase runs from 0 to 1 in
+``gait.period``; each foot's phase is that plus its offset. A foot stands in the first share of its phase
+(``gait.stance``) and swings in the rest. While the command is to stand, the clock rests at 0; it starts from 0 when the
+command is to move. ``legged_mw.deploy.controller`` keeps the same clock.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from legged_mw.utils.config import ConfigError
 
 
 class FootContacts:
-    """How many contacts each of F feet has with the ground, and the force on it where that is sensed; a foot may have several geoms."""
+    """The number of contacts of each of F feet with the ground, and the force on it where that is sensed.
+
+    A foot may have several geoms.
+    """
 
     written = ("count", "forces")
-    forces: Tensor | None = None  # (N, F, 3) of the ground on the foot, world frame [N]; only where something reads it
+    forces: Tensor | None = None  # (N, F, 3) of the ground on the foot, world frame [N]; only if a term or row reads it
 
     def __init__(self, robot: RobotModel, feet: Collection[tuple[str, ...]], sensed: Tensor, count: Tensor) -> None:
-        """``feet`` are the geoms of each, the first columns of ``count`` (N, C); ``sensed`` are all sensors."""
+        """``feet`` are the geoms of each, the first columns of ``count`` (N, C); ``sensed`` are all sensors' values."""
         geoms = list(dict.fromkeys(geom for each in feet for geom in each))  # G
         table = torch.tensor([[float(geom in each) for each in feet] for geom in geoms], device=count.device)  # (G, F)
         self._foot_of_geom = table if [(geom,) for geom in geoms] != [*feet] else None
         self._counts = count[:, : len(geoms)]
         self.count = self._counts if self._foot_of_geom is None else count.new_zeros(len(count), len(feet))  # (N, F)
         if CONTACT_FORCE in robot.sensors:
-            # (N, C, 4): count, force on the ground
-            columns = sensed[:, robot.sensors[CONTACT_FORCE]].unflatten(1, (-1, 4))
-            # (N, 1, G, 3), (F, G, 1)
-            self._geom_forces, self._against = columns[:, None, : len(geoms), 1:], -table.T[..., None]
+            columns = sensed[:, robot.sensors[CONTACT_FORCE]].unflatten(1, (-1, 4))  # (N, C, count and force on ground)
+            self._geom_forces, self._against = columns[:, None, : len(geoms), 1:], -table.T[..., None]  # (N, 1, G, 3)
             self.forces = count.new_zeros(len(count), len(feet), 3)
 
     def update(self) -> None:
-        """After a step: what its last substep sensed."""
+        """Read the contacts of the last substep."""
         if self._foot_of_geom is not None:
             torch.mm(self._counts, self._foot_of_geom, out=self.count)
         if self.forces is not None:
@@ -49,36 +50,35 @@ class FootContacts:
 
 
 class GaitClock:
-    """The clocks of N worlds with F feet; fixed tensors, written in place, as a recorded step needs them."""
+    """The clocks of N worlds with F feet: fixed tensors, written in place."""
 
     written = ("phase", "running", "foot_phase", "row")
 
     def __init__(
         self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str
     ) -> None:
-        """``dt`` [s] is a control step. Raises ConfigError for offsets that are not one a foot."""
+        """``dt`` [s] is a control step. Raises ConfigError unless there is one offset a foot."""
         self.offsets = _offsets(cfg, feet)
         self.stance, self._random_start = cfg.stance, cfg.random_start
         self._share = dt / cfg.period  # of the period in a control step
         self._shift = torch.tensor(self.offsets, device=device)  # (F,)
         self.phase = torch.zeros(num_envs, device=device)  # (N,) share of the period, as last observed
-        self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) as last observed: told to move
+        self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) last observed: commanded to move
         self.foot_phase = torch.zeros(num_envs, len(feet), device=device)  # (N, F) from 0 to 1
-        # sine of each foot's phase, then cosine; 0 at rest
-        self.row = torch.zeros(num_envs, 2 * len(feet), device=device)
+        self.row = torch.zeros(num_envs, 2 * len(feet), device=device)  # sines of the phases, then cosines; 0 at rest
 
     def tick(self) -> None:
-        """A control step has passed: clocks that run go on."""
+        """Advance the running clocks by a control step."""
         self.phase.add_(self.running, alpha=self._share).remainder_(1.0)
 
     def restart(self, mask: Tensor) -> None:
-        """An episode begins where ``mask`` (N,) is true: anywhere in the period, so that each leg learns to lead."""
+        """Start anywhere in the period where ``mask`` (N,) is true, so that each leg learns to lead."""
         start = torch.rand_like(self.phase) if self._random_start else torch.zeros_like(self.phase)
         self.phase.copy_(torch.where(mask, start, self.phase))
-        self.running.logical_or_(mask)  # whether it runs is for the command to say, in ``observe``
+        self.running.logical_or_(mask)  # ``observe`` stops it if the command is to stand
 
     def observe(self, moving: Tensor) -> None:
-        """Fill ``row`` by the commands that are about to be seen; ``moving`` (N,) is where they say to move. Twice is as good as once."""
+        """Fill ``row`` for the next observation, where ``moving`` (N,) means to move. A second call changes nothing."""
         self.phase.masked_fill_(~moving, 0.0)
         self.running.copy_(moving)
         torch.add(self.phase[:, None], self._shift, out=self.foot_phase).remainder_(1.0)
@@ -86,17 +86,17 @@ class GaitClock:
         self.row.copy_(torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)).masked_fill_(~moving[:, None], 0.0)
 
     def swing(self) -> Tensor:
-        """How far each foot is in its swing (N, F), from 0 to 1; 0 in stance and at rest."""
+        """The progress of each foot in its swing (N, F), from 0 to 1; 0 in stance and at rest."""
         share = (self.foot_phase - self.stance).clamp(min=0.0) / (1.0 - self.stance)
         return share.masked_fill(~self.running[:, None], 0.0)
 
     def wants_contact(self) -> Tensor:
-        """Which feet should stand (N, F); all at rest."""
+        """The feet that should stand (N, F); all at rest."""
         return (self.foot_phase < self.stance) | ~self.running[:, None]
 
 
 def _offsets(cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...]) -> list[float]:
-    """One a foot: the config's, or of two feet half a period apart."""
+    """The config's offsets, one a foot; without them two feet are half a period apart."""
     if cfg.offsets and len(cfg.offsets) == len(feet):
         return list(cfg.offsets)
     if not cfg.offsets and len(feet) == 2:

@@ -1,10 +1,10 @@
 """A legged robot that walks by command: commands, feet, ground and their curricula, read top to bottom.
 
-What every task shares - acting, sensing of base and joints, resets, the reward machinery - is in ``robot_task``, and its
-rules hold here too. The reward terms are at the end. Shapes: N environments, C commands, F feet.
+Acting, sensing the base and joints, resets and the reward machinery are in ``robot_task``, and its rules hold here too.
+The reward terms are at the end. Shapes: N environments, C commands, F feet.
 
-Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym; [UL] unitree_rl_lab; [I] Isaac Lab's velocity
-tasks; [M] mjlab; [H] holosoma; [W] walk-these-ways.
+Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym; [UL] unitree_rl_lab; [I] Isaac Lab's
+velocity tasks; [M] mjlab; [H] holosoma; [W] walk-these-ways.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.math import assign, maybe_any, quat_rotate, spread, wrap_to_pi, yaw_of
 
-PHASE_SIGMA = 0.01  # [m^2] of feet_phase: 0.1 m beside the wanted height leave a share of 1/e [P]
+PHASE_SIGMA = 0.01  # [m^2] of feet_phase: an error of 0.1 m in height gives 1/e [P]
 
 
 class LeggedRobot(RobotTask):
@@ -59,12 +59,13 @@ class LeggedRobot(RobotTask):
         self.is_commanded(out=self.moving)
 
     def is_commanded(self, out: Tensor | None = None) -> Tensor:
-        """(N,) The velocity command is more than to stand; written into ``out``, if there is one."""
+        """(N,) The velocity command is to move, not to stand; written into ``out`` if given."""
         return torch.gt(self.velocity_command.square().sum(dim=1), self.cfg.rewards.min_command**2, out=out)
 
     def _end_step(self) -> None:
-        """What the next step remembers; the reward has seen this step's values."""
         super()._end_step()
+        if "last_foot_vel_z" in vars(self):
+            self.last_foot_vel_z.copy_(self.foot_vel[..., 2])
         self.feet_air_time.masked_fill_(self.foot_contact, 0.0)
         self.swing_peak.masked_fill_(self.foot_contact, 0.0)
         if self.gait:
@@ -96,13 +97,13 @@ class LeggedRobot(RobotTask):
         if self.gait:
             self.gait.restart(mask)
 
-    # ---- ground -------------------------------------------------------------------------------------------------------
+    # ---- ground -----------------------------------------------------------------------------------------------------
 
     def _measure_ground(self) -> None:
-        """Feet, their heights and the root's above the ground under each, and how far the robot came."""
+        """Feet, their heights and the root's above the ground, and how far the robot walked."""
         torch.index_select(self.sim.site_xpos, 1, self.foot_sites, out=self.foot_pos)
         if not (self.tiles and self._height_at):
-            return  # foot_height is the z of foot_pos
+            return  # on a plane foot_height is the z of foot_pos
         points = torch.cat([self.foot_pos, self.root_pos[:, None]], dim=1)
         above = points[..., 2] - self._height_at(points[..., :2])
         self.foot_height.copy_(above[:, :-1])
@@ -116,7 +117,7 @@ class LeggedRobot(RobotTask):
         torch.maximum(self.max_distance, away, out=self.max_distance)
 
     def _scan_heights(self) -> None:
-        """The height scan: how far the ground lies below where it is when the robot stands on level ground, within 1 m."""
+        """The height scan [m]: 0 where the robot stands on level ground, positive for lower ground, within 1 m."""
         root, yaw = self.root_pos, yaw_of(self.root_quat)
         cos, sin = torch.cos(yaw)[:, None], torch.sin(yaw)[:, None]
         px, py = self.scan_points
@@ -127,7 +128,7 @@ class LeggedRobot(RobotTask):
         self.height_scan.copy_(level.clamp(-1.0, 1.0).expand_as(self.height_scan))
 
     def _start_places(self, offset: Tensor) -> Tensor:
-        """On the tile that the world is on, (N, 3) [m, world]."""
+        """On the world's tile, (N, 3) [m, world]."""
         if not self.tiles:
             return super()._start_places(offset)
         place = self.init_pos + self.tiles.origins
@@ -137,7 +138,7 @@ class LeggedRobot(RobotTask):
         return torch.cat([at, height], dim=1)
 
     def _update_curricula(self, mask: Tensor) -> None:
-        """Where ``mask`` (N,) is true an episode has ended: kicks, levels of ground, ranges of commands."""
+        """Kicks, terrain levels and command ranges."""
         super()._update_curricula(mask)
         if self.tiles:
             self._update_terrain_curriculum(mask)
@@ -145,23 +146,23 @@ class LeggedRobot(RobotTask):
             self._update_command_curriculum(mask)
 
     def _share_survived(self) -> Tensor:
-        """(N,) Leaving the terrain ends an episode early, though it is no fall."""
-        early = self.walked_off & (self.episode_steps[:, 0] > 0.0)
-        return torch.where(early, self.episode_steps[:, 0] / self.max_episode_length, super()._share_survived())
+        """(N,) Leaving the terrain ends an episode early, but is no fall."""
+        share = self.episode_steps[:, 0] / self.max_episode_length
+        return torch.where(self.walked_off, share, super()._share_survived())
 
     def _update_terrain_curriculum(self, mask: Tensor) -> None:
-        """One level up where the robot left its tile; one down where it covered less than half of what the command asked. [L]
+        """One level up where the robot left its tile; one down if it walked less than half the commanded distance. [L]
 
-        A robot that fell still owes what its last command would have asked until the end of the episode.
+        A robot that fell also owes the distance of its last command until the end of the episode.
         """
         assert self.tiles
         left = (self.max_episode_length - self.episode_steps[:, 0]).clamp(min=0.0) * self.dt
-        asked = self.commanded_distance[:, 0] + torch.where(self.fell, self.commanded_speed[:, 0] * left, 0.0)
+        owed = self.commanded_distance[:, 0] + torch.where(self.fell, self.commanded_speed[:, 0] * left, 0.0)
         up = self.max_distance[:, 0] > self.tiles.size / 2
-        down = ~up & (self.progress[:, 0] < 0.5 * asked)
-        self.tiles.promote(mask & (self.episode_steps[:, 0] > 0.0), up, down)
+        down = ~up & (self.progress[:, 0] < 0.5 * owed)
+        self.tiles.promote(mask, up, down)
 
-    # ---- commands -----------------------------------------------------------------------------------------------------
+    # ---- commands ---------------------------------------------------------------------------------------------------
 
     def _reset_commands(self, mask: Tensor) -> None:
         """A new episode's command is uniform over the ranges."""
@@ -170,7 +171,7 @@ class LeggedRobot(RobotTask):
         self._draw_heading(mask)
 
     def _resample_commands(self, mask: Tensor) -> None:
-        """Where a timer ended, each command keeps its value, or goes to its default (a velocity to 0), or to a new uniform value."""
+        """Where a timer ended a command keeps its value, or gets its default (velocities 0) or a new uniform value."""
         count = len(self.command_table)
         chance = torch.rand(self.num_envs, 2 * count, device=self.device)
         fresh = torch.where(chance[:, :count] < self.keep_probability, self._uniform_commands(), self.rest_command)
@@ -180,7 +181,7 @@ class LeggedRobot(RobotTask):
         self._draw_heading(mask)
 
     def _draw_heading(self, mask: Tensor) -> None:
-        """A new heading where ``mask`` (N,) is true, and what it asks of the yaw rate; not where the caller gives the commands. [L]"""
+        """A new heading where ``mask`` (N,) is true, and its yaw rate; not if the caller gives the commands. [L]"""
         commands = self.cfg.commands
         if commands.heading_command and commands.resampling_time > 0:
             low, high = commands.ranges.heading
@@ -188,7 +189,7 @@ class LeggedRobot(RobotTask):
             self._steer_to_heading()
 
     def _steer_to_heading(self) -> None:
-        """The yaw rate is in proportion to what the heading is off by, within its range. [L]"""
+        """The yaw rate is proportional to the heading error, within its range. [L]"""
         error = wrap_to_pi(self.heading - yaw_of(self.root_quat))
         low, high = self.command_ranges[:, 2]
         self.commands[:, 2] = (self.cfg.commands.heading_gain * error).clamp(low, high)
@@ -203,33 +204,32 @@ class LeggedRobot(RobotTask):
         return torch.empty(self.num_envs, 1, device=self.device).exponential_().mul_(mean).round_()
 
     def _update_command_curriculum(self, mask: Tensor) -> None:
-        """When as many episodes have ended as there are worlds: wider ranges, if they tracked the velocity well. [L]"""
+        """Every N ended episodes: wider ranges, if they tracked the velocity well. [L]"""
         share, total, count = self.command_curriculum  # each ()
-        best = self.reward_scales[self.reward_names.index("tracking_lin_vel")] * self.episode_steps[:, 0]
-        ended = mask & (self.episode_steps[:, 0] > 0.0)
-        tracked = self.episode_sums[:, self.reward_names.index("tracking_lin_vel")] / best.clamp(min=1e-9)
-        total.add_(torch.where(ended, tracked, 0.0).sum())
-        count.add_(ended.sum())
+        term = self.reward_names.index("tracking_lin_vel")
+        best = self.reward_scales[term] * self.episode_steps[:, 0]
+        tracked = self.episode_sums[:, term] / best.clamp(min=1e-9)
+        total.add_(torch.where(mask, tracked, 0.0).sum())
+        count.add_(mask.sum())
         full = count >= self.num_envs
         grown = full & (total > 0.8 * count)
         share.copy_(torch.where(grown, share + self.cfg.commands.curriculum_step, share).clamp(max=1.0))
-        for memory in (total, count):
-            memory.masked_fill_(full, 0.0)
+        total.masked_fill_(full, 0.0)
+        count.masked_fill_(full, 0.0)
         self._set_command_ranges()
 
     def _set_command_ranges(self) -> None:
-        """The share of the ranges that commands come from, around their defaults."""
+        """Shrink the ranges of the commands to the curriculum's share, around their defaults."""
         torch.lerp(self._narrowest, self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
 
-    # ---- observations ---------------------------------------------------------------------------------------------------
+    # ---- observations -----------------------------------------------------------------------------------------------
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
         return {
             "state": [
                 *self._measured_rows(),
                 *self._gait_rows(),
-                # vx, vy [m/s], yaw rate [rad/s], body frame; further ones
-                Row("commands", self.commands, mirror="command"),
+                Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame; others
                 *self._height_rows("state", self.cfg.noise.scales.height_scan),
             ],
             "privileged_state": [
@@ -238,38 +238,30 @@ class LeggedRobot(RobotTask):
                 Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
                 Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar", unit="m/s", frame="world"),
                 Row("feet_air_time", self.feet_air_time, mirror="foot", unit="s"),  # since lift-off; 0 in contact
-                *self._asked_foot_rows(),
+                *self._more_foot_rows(),
                 *self._disturbance_rows(),
                 *self._height_rows("privileged_state"),
             ],
         }
 
     def _gait_rows(self) -> list[Row]:
-        """The gait clock, where there is one: sine of each foot's phase, then cosine; zeros while told to stand."""
+        """With a gait clock the sines of the feet's phases, then the cosines; zeros when commanded to stand."""
         return [Row("gait_clock", self.gait.row, mirror="foot")] if self.gait else []
 
-    def _asked_foot_rows(self) -> list[Row]:
-        """Of each foot, where ``observations`` asks for it: height above the ground under it; the ground's force, in 100 N."""
-        rows, asked = [], self.cfg.observations
-        if asked.foot_height:
-            rows.append(
-                Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="site above the ground under it")
-            )
-        if asked.contact_forces:
-            rows.append(
-                Row(
-                    "contact_forces",
-                    self.contact_forces.flatten(1),
-                    mirror="foot_polar",
-                    scale=0.01,
-                    unit="N",
-                    frame="world",
-                )
-            )
+    def _more_foot_rows(self) -> list[Row]:
+        """Rows that ``observations`` switches on: feet's heights above the ground; ground's forces, in 100 N."""
+        rows = []
+        if self.cfg.observations.foot_height:
+            frame = "site above the ground under it"
+            rows.append(Row("foot_height", self.foot_height, mirror="foot", unit="m", frame=frame))
+        if self.cfg.observations.contact_forces:
+            forces = self.contact_forces.flatten(1)
+            row = Row("contact_forces", forces, mirror="foot_polar", scale=0.01, unit="N", frame="world")
+            rows.append(row)
         return rows
 
     def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
-        """The height scan [m], x by x from behind, in each from right to left; where ``terrain.height_scan`` names the group."""
+        """The height scan [m] if ``terrain.height_scan`` names the group: by x from behind, each from right to left."""
         row = Row("height_scan", self.height_scan, noise, mirror="height_scan", measured=group == "state")
         return [row] if group in self.cfg.terrain.height_scan else []
 
@@ -286,13 +278,12 @@ class LeggedRobot(RobotTask):
             left_out = "height_scan" in self.cfg.observations.leave_out.get(group, [])
             if not left_out and not any(row.name == "height_scan" for row in self.observations.groups.get(group, [])):
                 here = f"{type(self).__name__}.observation_rows has no row height_scan in '{group}'"
-                raise ConfigError(
-                    f"terrain.height_scan names '{group}', but {here}; add *self._height_rows('{group}', noise) to it"
-                )
+                mend = f"add *self._height_rows('{group}', noise) to it"
+                raise ConfigError(f"terrain.height_scan names '{group}', but {here}; {mend}")
 
     def _mirror_blocks(self) -> dict[str, Block]:
         terrain, blocks = self.cfg.terrain, super()._mirror_blocks()
-        blocks |= {**foot_blocks(self._partners()), "command": command_block(self.command_table, self._mirror_reach())}
+        blocks |= {**foot_blocks(self._partners()), "command": command_block(self.command_table, self.mirror_reach)}
         if terrain.height_scan:
             blocks["height_scan"] = scan_block(terrain.measured_points_x, terrain.measured_points_y)
         return blocks
@@ -308,10 +299,10 @@ class LeggedRobot(RobotTask):
                     raise ConfigError(f"{what}: name it too, or {NO_MIRROR}") from None
             raise
 
-    # ---- statistics, checkpoint -----------------------------------------------------------------------------------------
+    # ---- statistics, checkpoint -------------------------------------------------------------------------------------
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Mean levels of the terrain, of all worlds and by kind, and the share of the ranges that commands come from."""
+        """Mean terrain levels, of all worlds and by kind, and the curriculum's share of the command ranges."""
         live = super()._live_statistics()
         if self.tiles:
             live |= self.tiles.statistics()
@@ -329,29 +320,27 @@ class LeggedRobot(RobotTask):
         return state
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from ``training_state``; on terrain with new episodes."""
+        """Continue from ``training_state``; on terrain with new episodes."""
         super().load_training_state(state)
         if "command_curriculum" in state and self.cfg.commands.curriculum:
             self.command_curriculum.copy_(state["command_curriculum"])
             if int(state["num_envs"]) != self.num_envs:
-                self.command_curriculum[1:] = 0.0  # what was counted was of other worlds
+                self.command_curriculum[1:] = 0.0  # these counts were of other worlds
             self._set_command_ranges()
         if "terrain_levels" in state and self.tiles:
-            self._episode.zero_()  # what was under way counts for nothing
+            self._episode.zero_()  # unfinished episodes do not count
             levels, last = spread(state["terrain_levels"], self.num_envs), self.tiles.num_levels - 1
             if beyond := int((levels > last).sum()):
-                print(
-                    f"terrain: {beyond} worlds go on on level {last}, the last one here; the checkpoint has them higher",
-                    flush=True,
-                )
+                where = f"on level {last}, the last one here; the checkpoint has them higher"
+                print(f"terrain: {beyond} worlds go on {where}", flush=True)
             self.tiles.put(levels.clamp(max=last))
             self._reset_all()
 
-    # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
+    # ---- robot and buffers: made here, never rebound ----------------------------------------------------------------
 
     @property
     def foot_names(self) -> tuple[str, ...]:
-        """What the config calls the feet, in the order of all that is per foot."""
+        """``asset.foot_names``: the order of the feet in every tensor."""
         return tuple(self.cfg.asset.foot_names)
 
     @property
@@ -361,9 +350,8 @@ class LeggedRobot(RobotTask):
 
     def _make_terrain(self) -> Terrain | None:
         if not isinstance(self.cfg, LeggedRobotCfg):
-            raise ConfigError(
-                f"{type(self).__name__} walks by command: it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}"
-            )
+            what = f"it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}"
+            raise ConfigError(f"{type(self).__name__} walks by command: {what}")
         return build_terrain(self.cfg)
 
     def _load_robot(self, engine: str) -> RobotModel:
@@ -382,13 +370,12 @@ class LeggedRobot(RobotTask):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.num_feet = feet = len(self.foot_names)
-        # view, world frame [m/s]
-        self.foot_vel = self.sim.sensordata[:, self.robot.sensors["linvel"]].unflatten(1, (feet, 3))
+        linvel = self.sim.sensordata[:, self.robot.sensors["linvel"]]
+        self.foot_vel = linvel.unflatten(1, (feet, 3))  # view, world frame [m/s]
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
         self.foot_pos = self.buffer(feet, 3)  # [m, world]
-        self.feet = self.remember(
-            FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
-        )
+        contacts = FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
+        self.feet = self.remember(contacts)
         self.foot_contact, self.first_contact = (self.buffer(feet, dtype=torch.bool) for _ in range(2))
         self.foot_speed = self.buffer(feet)  # horizontal [m/s]
         self._init_terrain()
@@ -400,95 +387,82 @@ class LeggedRobot(RobotTask):
         self._init_foot_rewards()
 
     def _episode_columns(self) -> dict[str, int]:
-        feet = len(self.foot_names)
-        ground = (
-            {"progress": 1, "commanded_distance": 1, "commanded_speed": 1, "max_distance": 1} if self.terrain else {}
-        )
-        return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **ground}
+        times = ["feet_contact_time", "last_air_time", "last_contact_time"]
+        wanted = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
+        of_feet = [name for term in self._active_scales() for name in wanted.get(term, [])]
+        of_feet += ["feet_air_time", "swing_peak"]
+        ground = ["progress", "commanded_distance", "commanded_speed", "max_distance"] if self.terrain else []
+        feet, walk = dict.fromkeys(of_feet, len(self.foot_names)), dict.fromkeys(ground, 1)
+        return {**super()._episode_columns(), **feet, **walk}
 
     feet_air_time: Tensor  # (N, F) since the last contact [s]
     swing_peak: Tensor  # (N, F) highest foot position since the last contact [m]
     progress: Tensor  # (N, 1) along the commands [m]; only on terrain, as the three below
-    commanded_distance: Tensor  # (N, 1) what the commands asked [m]
-    commanded_speed: Tensor  # (N, 1) what the last one asked [m/s]
+    commanded_distance: Tensor  # (N, 1) [m]
+    commanded_speed: Tensor  # (N, 1) of the last command [m/s]
     max_distance: Tensor  # (N, 1) from the middle of the tile, along x or y [m]
+    feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance` or `air_time_variance`
+    last_air_time: Tensor  # (N, F) of the last swing that ended [s]; only with `air_time_variance`
+    last_contact_time: Tensor  # (N, F) of the last stance that ended [s]; likewise
+    last_foot_vel_z: Tensor  # (N, F) of the step before [m/s]; only with `feet_impact_vel`
 
     def _init_terrain(self) -> None:
-        """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""
+        """Tiles and heights, if there is terrain, and the points of the height scan, (P,) x and y [m]."""
         cfg, terrain = self.cfg.terrain, self.terrain
         self.tiles = self.remember(Tiles(self.cfg, terrain, self.num_envs, self.device)) if terrain else None
         self._height_at = make_height_map(terrain, self.device) if terrain else None
-        # above the ground under each foot and under the root [m]
-        self.foot_height = self.buffer(self.num_feet) if terrain else self.foot_pos[..., 2]
-        self.base_height = self.buffer() if terrain else self.base_height
-        grid = torch.cartesian_prod(torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)).view(
-            -1, 2
-        )
+        self.foot_height = self.buffer(self.num_feet) if terrain else self.foot_pos[..., 2]  # above the ground [m]
+        self.base_height = self.buffer() if terrain else self.base_height  # likewise
+        xs, ys = torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)
+        grid = torch.cartesian_prod(xs, ys).view(-1, 2)
         self.scan_points = grid.to(self.device, torch.float).unbind(dim=1)
         self.height_scan = self.buffer(len(grid) if cfg.height_scan else 0)  # (N, P) [m]
 
     def _init_commands(self) -> None:
-        cfg = self.cfg.commands
-        self.command_table = command_table(self.cfg)
-        count, default = len(self.command_table), self._tensor([command.default for command in self.command_table])
+        cfg, table = self.cfg.commands, command_table(self.cfg)
+        self.command_table, count = table, len(table)
         self.commands, self.command_timer = self.buffer(count), self.buffer(1)  # [unit of each]; [control steps]
         self.velocity_command = self.commands[:, :3]  # view: vx, vy [m/s], yaw rate [rad/s]
-        self.heading = self.buffer()  # wanted, of the root's x axis in the world [rad]
-        # (2, C)
-        self.full_command_ranges = self._tensor(
-            [[command.low, command.high] for command in self.command_table]
-        ).T.contiguous()
-        self.command_ranges = self.remember(self.full_command_ranges.clone())
-        self._narrowest = default.expand(2, count)
-        self.rest_command = self._tensor(
-            [0.0 if command.name in VELOCITY else command.default for command in self.command_table]
-        )
+        self.heading = self.buffer()  # wanted heading of the root's x axis in the world [rad]
+        ranges = self._tensor([[command.low, command.high] for command in table])
+        self.full_command_ranges = ranges.T.contiguous()  # (2, C)
+        self.command_ranges = self.remember(self.full_command_ranges.clone())  # those that commands come from
+        self._narrowest = self._tensor([command.default for command in table]).expand(2, count)
+        rest = [0.0 if command.name in VELOCITY else command.default for command in table]
+        self.rest_command = self._tensor(rest)
         self.keep_probability = self._tensor([*cfg.keep_probability, *[1.0] * (count - len(cfg.keep_probability))])
-        self.command_curriculum = self.remember(
-            self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
-        )
+        # share of the ranges; sum and number of the episodes since it last grew
+        curriculum = self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
+        self.command_curriculum = self.remember(curriculum)
         if cfg.curriculum:
             self._set_command_ranges()
 
-    # ---- what reward terms need beside the state, where they are on ---------------------------------------------------
+    # ---- reward terms, and what the active ones need besides the state ----------------------------------------------
 
     def on_training_progress(self, share: float) -> None:
-        """Follow a training, of which ``share`` (0 to 1) is done: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
+        """Move ``tracking_sigma`` towards ``rewards.tracking_sigma_end``; a ``share`` (0 to 1) of training is done."""
         super().on_training_progress(share)
         begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
         if isinstance(self.tracking_sigma, Tensor):
             self.tracking_sigma.fill_(begin + (end - begin) * share)
 
     def _init_foot_rewards(self) -> None:
-        """What terms need beside the state, where they are on."""
-        sigma, changes = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end > 0.0
-        # () [m^2/s^2, rad^2/s^2]; a number where it stays, which takes an operation less
-        self.tracking_sigma: Tensor | float = sigma
-        if changes:
-            self.tracking_sigma = self.remember(torch.tensor(sigma, device=self.device))
-        on = self._active_scales()
+        """Allocate what the active terms need besides the state."""
+        on, rewards = self._active_scales(), self.cfg.rewards
+        self.tracking_sigma: Tensor | float = rewards.tracking_sigma  # [m^2/s^2, rad^2/s^2]; a tensor () if it changes
+        if rewards.tracking_sigma_end > 0.0:
+            self.tracking_sigma = self.remember(torch.tensor(rewards.tracking_sigma, device=self.device))
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return
         stands = upright(self.robot, self.default_dof_pos.tolist(), self.foot_names)
-        # (F, 3) the vertical in each foot's frame, in the default pose; (F,) index of each foot's body
-        self.foot_up = torch.tensor(stands.up, dtype=torch.float, device=self.device)
-        self.foot_bodies = torch.tensor(stands.bodies, dtype=torch.long, device=self.device)
+        # (N, F, 3) the vertical in each foot's frame, in the default pose
+        self.foot_up = self._tensor(stands.up).expand(self.num_envs, -1, -1)
+        self.foot_bodies = torch.tensor(stands.bodies, dtype=torch.long, device=self.device)  # (F,) each foot's body
         if "feet_distance" in on and self.num_feet > 1:
             other = [1, 0] if self.num_feet == 2 else self._partners().sites
             pairs = [(i, j) for i, j in enumerate(other) if stands.places[i, 1] > stands.places[j, 1]]
-            # (2, pairs) feet to the left and to the right of each other
+            # (2, pairs) the left foot and the right foot of each pair
             self.neighbours = torch.tensor(pairs, dtype=torch.long, device=self.device).view(-1, 2).T.contiguous()
-
-    def _columns_for_rewards(self) -> dict[str, int]:
-        times = ["feet_contact_time", "last_air_time", "last_contact_time"]
-        wanted = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
-        names = [name for term in self._active_scales() for name in wanted.get(term, [])]
-        return {**super()._columns_for_rewards(), **dict.fromkeys(names, len(self.foot_names))}
-
-    feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance` or `air_time_variance`
-    last_air_time: Tensor  # (N, F) of the last swing that ended [s]; only with `air_time_variance`
-    last_contact_time: Tensor  # (N, F) of the last stance that ended [s]; likewise
-    last_foot_vel_z: Tensor  # (N, F) of the step before [m/s]; only with `feet_impact_vel`
 
     def _sensed_on_demand(self) -> list[str]:
         row = [CONTACT_FORCE] if self.cfg.observations.contact_forces else []
@@ -502,7 +476,7 @@ class LeggedRobot(RobotTask):
         return self.feet.forces
 
     def _time_contacts(self) -> None:
-        """How long feet stood and swung, where a term that is on reads it; ``feet_air_time`` has this step's already."""
+        """Time stances and swings if an active term reads them, after ``feet_air_time`` has counted this step."""
         own = vars(self)
         if "last_air_time" in own:
             lifted = ~self.foot_contact & (self.feet_contact_time > 0.0)
@@ -510,13 +484,6 @@ class LeggedRobot(RobotTask):
             self.last_contact_time.copy_(torch.where(lifted, self.feet_contact_time, self.last_contact_time))
         if "feet_contact_time" in own:
             self.feet_contact_time.add_(self.dt).masked_fill_(~self.foot_contact, 0.0)
-
-    def _remember_for_rewards(self) -> None:
-        super()._remember_for_rewards()
-        if "last_foot_vel_z" in vars(self):
-            self.last_foot_vel_z.copy_(self.foot_vel[..., 2])
-
-    # ---- commands
 
     def _reward_tracking_lin_vel(self) -> Tensor:
         """Velocity in the plane at the IMU, body frame, as commanded. [L]"""
@@ -532,14 +499,12 @@ class LeggedRobot(RobotTask):
         """Joints away from the default pose while the command is to stand [rad]. [L]"""
         return self.dof_offset.abs().sum(dim=1).masked_fill_(self.moving, 0.0)
 
-    # ---- feet
-
     def _reward_feet_clearance(self) -> Tensor:
         """Feet that move fast away from the swing height [m^1.5/s^0.5]. [P]"""
         return ((self.foot_height - self.cfg.rewards.swing_height).abs() * self.foot_speed.sqrt()).sum(dim=1)
 
     def _reward_feet_height(self) -> Tensor:
-        """At touch-down, how far the swing's peak was from the swing height, as a share of it. [P]"""
+        """At touch-down, the squared error of the swing's peak, as a share of the swing height. [P]"""
         error = (self.swing_peak / self.cfg.rewards.swing_height - 1.0).square()
         return (error * (self.first_contact & self.moving[:, None])).sum(dim=1)
 
@@ -548,14 +513,15 @@ class LeggedRobot(RobotTask):
         return (self.foot_speed.square() * (self.foot_contact & self.moving[:, None])).sum(dim=1)
 
     def _reward_feet_air_time(self) -> Tensor:
-        """At touch-down, how much longer than the minimum the foot was in the air [s], while moving. [L, P]"""
+        """At touch-down, the foot's time in the air beyond ``rewards.min_air_time`` [s], while moving. [L, P]"""
         excess = self.feet_air_time - self.cfg.rewards.min_air_time
         return (excess * (self.first_contact & self.moving[:, None])).sum(dim=1)
 
     def _reward_feet_distance(self) -> Tensor:
-        """How much nearer than ``rewards.min_feet_distance`` left and right feet are sideways, in the base's heading [m]. [P, H]
+        """Lack of sideways distance between left and right feet, of ``rewards.min_feet_distance`` [m]. [P, H]
 
-        Feet that cross are nearer than 0. Of more than two feet it is the sum over mirrored pairs.
+        Sideways is across the base's heading; feet that cross have a negative distance. Of more than two feet it is the
+        sum over mirrored pairs.
         """
         require(self.num_feet > 1, "feet_distance", "asset.foot_names has one foot, which has no neighbour")
         yaw, (left, right) = yaw_of(self.root_quat)[:, None], self.neighbours
@@ -564,30 +530,26 @@ class LeggedRobot(RobotTask):
         return (self.cfg.rewards.min_feet_distance - sideways).clamp(min=0.0).sum(dim=1)
 
     def _reward_feet_orientation(self) -> Tensor:
-        """Sum over feet of the squared sine of their tilt; a foot is flat as it is in the default pose. [H -5]"""
-        up = quat_rotate(
-            self.sim.xquat.index_select(1, self.foot_bodies), self.foot_up.expand(len(self.foot_contact), -1, -1)
-        )
+        """Sum over feet of the squared sine of their tilt; a foot is flat in the default pose. [H -5]"""
+        up = quat_rotate(self.sim.xquat.index_select(1, self.foot_bodies), self.foot_up)
         return up[..., :2].square().sum(dim=(1, 2))
 
     def _reward_air_time_variance(self) -> Tensor:
-        """How unlike the feet's last swings were, and their last stances: variances of their times, up to 0.5 s each [s^2]. [I, UL -1]"""
+        """Variances over feet of the last swing's and the last stance's time, at most 0.5 s each [s^2]. [I, UL -1]"""
         require(self.num_feet > 1, "air_time_variance", "asset.foot_names has one foot")
         swings, stances = (time.clamp(max=0.5).var(dim=1) for time in (self.last_air_time, self.last_contact_time))
         return swings + stances
 
     def _reward_feet_contact_without_cmd(self) -> Tensor:
-        """How many feet are on the ground while told to stand. [UL]"""
+        """Number of feet on the ground while the command is to stand. [UL]"""
         return self.foot_contact.sum(dim=1).float().masked_fill_(self.moving, 0.0)
 
     def _reward_feet_impact_vel(self) -> Tensor:
-        """At touch-down, the square of how fast the foot sank a step before [m^2/s^2]. [W, which counts feet that stand too]"""
+        """At touch-down, the foot's squared downward speed a step before [m^2/s^2]. [W, also for standing feet]"""
         return (self.last_foot_vel_z.clamp(max=0.0).square() * self.first_contact).sum(dim=1)
 
-    # ---- forces on feet
-
     def _reward_feet_contact_forces(self) -> Tensor:
-        """What the ground's forces on feet exceed ``rewards.max_contact_force`` by [N]. [L]"""
+        """The ground's forces on feet beyond ``rewards.max_contact_force`` [N]. [L]"""
         return (self.contact_forces.norm(dim=2) - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
 
     def _reward_soft_landing(self) -> Tensor:
@@ -599,19 +561,17 @@ class LeggedRobot(RobotTask):
         forces = self.contact_forces
         return (forces[..., :2].norm(dim=2) > 5.0 * forces[..., 2].abs()).any(dim=1).float()
 
-    # ---- two legs
-
     def _reward_single_stance(self) -> Tensor:
-        """Biped: how long it has stood on exactly one foot [s], up to ``rewards.max_single_stance``, while moving. [I]
+        """Biped: time on exactly one foot [s], at most ``rewards.max_single_stance``, while moving. [I]
 
-        The lesser of the standing foot's contact time and the other one's air time, so that short steps earn little.
+        It is the smaller of one foot's contact time and the other's air time, so that short steps earn little.
         """
         self._need_two_feet("single_stance")
         since = torch.where(self.foot_contact, self.feet_contact_time, self.feet_air_time).amin(dim=1)
         return torch.where(self._on_one_foot() & self.moving, since.clamp(max=self.cfg.rewards.max_single_stance), 0.0)
 
     def _reward_no_fly(self) -> Tensor:
-        """Biped: 1 on exactly one foot while moving, and on both while told to stand; else 0. [L: Cassie; standing ours]"""
+        """Biped: 1 on exactly one foot while moving, and on both while standing; else 0. [L: Cassie; standing ours]"""
         self._need_two_feet("no_fly")
         return torch.where(self.moving, self._on_one_foot(), self.foot_contact.all(dim=1)).float()
 
@@ -621,20 +581,18 @@ class LeggedRobot(RobotTask):
     def _need_two_feet(self, term: str) -> None:
         require(self.num_feet == 2, term, f"it is for robots with two feet; asset.foot_names has {self.num_feet}")
 
-    # ---- the gait clock
-
     def _clock(self, term: str) -> GaitClock:
         require(self.gait is not None, term, "there is no gait clock; set gait.period [s]")
         assert self.gait
         return self.gait
 
     def _reward_feet_phase(self) -> Tensor:
-        """From 0 to 1: feet as high as the clock wants, ``rewards.swing_height`` in mid swing and 0 in stance. [P, H 5]"""
+        """1 where feet have the clock's heights: ``rewards.swing_height`` in mid swing, 0 in stance. [P, H 5]"""
         swing = self._clock("feet_phase").swing()
         rise = 1.0 - (2.0 * swing - 1.0).abs()  # up to 1 in mid swing, and back
         wanted = self.cfg.rewards.swing_height * rise.square() * (3.0 - 2.0 * rise)  # a cubic, level at both ends [P]
         return torch.exp((self.foot_height - wanted).square().sum(dim=1) / -PHASE_SIGMA)
 
     def _reward_contact_phase(self) -> Tensor:
-        """Share of the feet that stand or swing as the clock wants. [U 0.18]"""
+        """Share of the feet that stand or swing by the clock. [U 0.18]"""
         return (self.foot_contact == self._clock("contact_phase").wants_contact()).float().mean(dim=1)

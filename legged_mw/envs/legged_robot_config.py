@@ -1,4 +1,4 @@
-"""What walking by command adds to RobotTask's fields, once, typed, with unit and source. Tasks override these in configs/.
+"""The fields that walking by command adds to RobotTask's, typed, with unit and source.
 
 Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
 """
@@ -32,9 +32,8 @@ from legged_mw.utils.errors import unknown
 
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
-CellSize = Annotated[
-    float, Bound("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25)
-]
+_CELL = Bound("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25)
+CellSize = Annotated[float, _CELL]
 Border = Annotated[float, Bound("1 m or more, for a robot that leaves the tiles to turn back", lambda v: v >= 1)]
 Marks = Annotated[list[Positive], or_empty(THREE)]
 
@@ -43,37 +42,32 @@ class LeggedRobotCfg(RobotTaskCfg):
     """Walking by command. Defaults are the joystick task [P]; the robot's own names and numbers are in configs/."""
 
     class asset(RobotTaskCfg.asset):
-        # of sites, and of geoms if foot_geoms says nothing; the order is the order in observations
-        foot_names: list[str] = []
-        # foot -> its geoms, names or patterns, where a foot is not one geom of its name
-        foot_geoms: dict[str, list[str]] = {}
+        foot_names: list[str] = []  # of sites, and of geoms without foot_geoms; in the order of observations
+        foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns; else the geom of its name
 
     class observations(RobotTaskCfg.observations):
         foot_height: bool = False  # a row of `privileged_state`: each foot's height above the ground under it [m]
-        # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
-        contact_forces: bool = False
+        contact_forces: bool = False  # a row of `privileged_state`: ground's force on each foot, world [N] [ours: off]
 
     class commands:
         resampling_time: Duration = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
-        change_probability: Share = 0.5  # that a component changes at all when the timer ends [P]
-        # of each command: that a changed one is not its default; beyond the list 1 [P]
+        change_probability: Share = 0.5  # that a command changes at all when the timer ends [P]
+        # for each command: that a changed one is not its default; 1 for those beyond the list [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]
 
-        # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
-        curriculum: bool = False
+        curriculum: bool = False  # start with a share of the ranges, widen it while velocity is tracked well [L]
         curriculum_start: PositiveShare = 0.4  # that share [-] [ours]
-        # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
+        # growth, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
         curriculum_step: PositiveShare = 0.1
 
         heading_command: bool = False  # the yaw rate steers to a heading that is drawn in its place [L]
         heading_gain: Positive = 0.5  # yaw rate a heading error, within its range [1/s] [L]
         units: dict[str, str] = {}  # of commands of your own, by name
-        mirror: dict[str, Sign] = {}  # likewise: 1.0, or -1.0 where left and right change its sign
-        # likewise: its value when nothing is asked; else 0, or the nearest to it in the range
-        default: dict[str, float] = {}
+        mirror: dict[str, Sign] = {}  # of commands of your own: 1.0, or -1.0 where left and right change the sign
+        default: dict[str, float] = {}  # of commands of your own: value at rest; else the nearest to 0 in the range
 
         class ranges:
-            """Lowest and highest of each command, in the order that the policy sees them. A task may declare its own after these."""
+            """Lowest and highest of each command, in the policy's order. A task may declare its own after these."""
 
             lin_vel_x: Range = [-1.5, 1.5]  # [m/s] [P]
             lin_vel_y: Range = [-0.8, 0.8]  # [m/s] [P]
@@ -81,28 +75,25 @@ class LeggedRobotCfg(RobotTaskCfg):
             heading: Range = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
 
     class gait:
-        """A clock (legged_mw/envs/feet.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
+        """A clock of each foot's step (legged_mw/envs/feet.py), for the policy, feet_phase and contact_phase."""
 
         period: Duration = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
-        # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
-        offsets: list[Share] = []
+        offsets: list[Share] = []  # each foot's phase at clock 0, share of the period; empty: of two feet [0.0, 0.5]
         stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
-        # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
-        random_start: bool = True
+        random_start: bool = True  # begin anywhere in the period: each leg learns to lead; False: at 0, as deploy
 
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
-        # where it goes in a straight line over max_iterations; 0: it stays [ours]
-        tracking_sigma_end: NonNegative = 0.0
-        swing_height: Swing = 0.1  # wanted height of a swinging foot [m] [P]
-        min_air_time: NonNegative = 0.1  # a step that lasts less is penalised [s] [P]
+        tracking_sigma_end: NonNegative = 0.0  # its value at max_iterations, reached linearly; 0: it stays [ours]
+        swing_height: Swing = 0.1  # target height of a swinging foot [m] [P]
+        min_air_time: NonNegative = 0.1  # a shorter step is penalised [s] [P]
         min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
         min_feet_distance: Height = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
         max_contact_force: NonNegative = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
         max_single_stance: Positive = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):
-            """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off. All [P]."""
+            """All [P]."""
 
             tracking_lin_vel: float = 1.0
             tracking_ang_vel: float = 0.5
@@ -120,20 +111,19 @@ class LeggedRobotCfg(RobotTaskCfg):
             feet_height: float = -0.2
             feet_slip: float = -0.1
             feet_air_time: float = 0.1
-            collision: float = 0.0  # of what asset.penalize_contacts_on names [L]
+            collision: float = 0.0  # of asset.penalize_contacts_on [L]
 
     class noise(RobotTaskCfg.noise):
         class scales(RobotTaskCfg.noise.scales):
             height_scan: NonNegative = 0.1  # [m] [L]
 
     class terrain(RobotTaskCfg.terrain):
-        mesh_type: Literal["plane", "heightfield"] = "plane"  # heightfield: a grid of tiles, all below is about it
+        mesh_type: Literal["plane", "heightfield"] = "plane"  # heightfield: a grid of tiles, with the fields below
         num_rows: Count = 10  # levels of difficulty, along x [L]
         num_cols: Count = 20  # tiles side by side along y, each column of one kind [L]
         tile_size: Positive = 8.0  # edge of a tile [m] [L]
-        # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
-        horizontal_scale: CellSize = 0.05
-        border_size: Border = 5.0  # flat ground around all tiles; a robot that leaves half of it behind starts again, timed out [m] [L 25]
+        horizontal_scale: CellSize = 0.05  # between two heights [m] [ours: L 0.1 makes a stair a slope of 50 degrees]
+        border_size: Border = 5.0  # flat ground around all tiles; past its middle an episode times out [m] [L 25]
         difficulty: ShareRange = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
         # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
         terrain_proportions: dict[str, NonNegative] = {
@@ -142,8 +132,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         }
         seed: NonNegativeInt = 1  # of all that is random in it
         curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
-        # highest level at the start of training; the last one, if there are fewer [L]
-        max_init_terrain_level: NonNegativeInt = 5
+        max_init_terrain_level: NonNegativeInt = 5  # highest level at the start of training, or the last one [L]
         measured_points_x: Points = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
         measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
         height_scan: list[Literal["state", "privileged_state"]] = []  # groups of observations that get the row
@@ -151,42 +140,35 @@ class LeggedRobotCfg(RobotTaskCfg):
     class exam:
         """The walking exam of --eval and of training (docs/grading.md); all [ours]."""
 
-        # lowest and highest lin_vel_x, lin_vel_y, ang_vel_yaw asked; not named: commands.ranges
-        ranges: dict[str, Range] = {}
-        # jumps of the base's velocity [m/s]; empty: 0.5, 1, 1.5, 2, 3, and 4, 5, 6 if not on two feet
-        push_speeds: list[Positive] = []
+        ranges: dict[str, Range] = {}  # lin_vel_x, lin_vel_y, ang_vel_yaw -> low, high; others: commands.ranges
+        push_speeds: list[Positive] = []  # jumps of velocity [m/s]; empty: 0.5 1 1.5 2 3, and 4 5 6 if not on two feet
         push_vx: float = 0.0  # vx of a robot that is pushed [m/s]; 0: half of the highest
         transport_vx: float = 0.0  # vx of the cost of transport [m/s]; 0: half of the highest
-        # walks: of vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest, 0.06, 0.1 of the highest
+        # highest errors or offsets of a walk: vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest vx,
+        # 0.06, 0.1 of the highest yaw rate, or offsets 0.06, 0.06, 0.12
         marks: Marks = []
-        # and offsets 0.06, 0.06, 0.12
-        # offset: of the mean velocity; empty: that on two feet, which sway, else error
+        # offset: of the mean velocity; empty: offset on two feet, which sway, else error
         marks_of: Literal["", "error", "offset"] = ""
-        push_mark: NonNegative = 0.0  # walks: all pushes of this speed are survived [m/s]; 0: 1 on two feet, else 2
-        # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
-        peer: str = ""
+        push_mark: NonNegative = 0.0  # a walk survives all pushes of this speed [m/s]; 0: 1 on two feet, else 2
+        peer: str = ""  # go1, go2, g1: compare with its published policies of legged_mw/eval/peers.py; empty: none
 
     def check(self) -> None:
         super().check()
-        feet = self.asset.foot_names
+        feet, commands = self.asset.foot_names, self.commands
         if not feet or "*" in "".join(feet) or len({*feet}) < len(feet):
             wanted = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
             raise ConfigError(f"asset.foot_names is {feet!r}; it must be {wanted}")
-        for name, span in vars(self.commands.ranges).items():  # a task may have declared its own
+        for name, span in vars(commands.ranges).items():  # a task may have declared its own
             fit(span, Range, f"commands.ranges.{name}")
-        names = [name for name in vars(self.commands.ranges) if name != HEADING]
-        if len(keep := self.commands.keep_probability) > len(names):
-            raise ConfigError(
-                f"commands.keep_probability has {len(keep)} numbers, but there are {len(names)} commands: {', '.join(names)}"
-            )
-        for foot in self.asset.foot_geoms:
-            if foot not in self.asset.foot_names:
-                raise ConfigError(
-                    f"asset.foot_geoms: {unknown('foot', foot, self.asset.foot_names, 'asset.foot_names')}"
-                )
-            if not self.asset.foot_geoms[foot]:
+        names = [name for name in vars(commands.ranges) if name != HEADING]
+        if len(commands.keep_probability) > len(names):
+            what = f"{len(commands.keep_probability)} numbers, but there are {len(names)} commands: {', '.join(names)}"
+            raise ConfigError(f"commands.keep_probability has {what}")
+        for foot, geoms in self.asset.foot_geoms.items():
+            if foot not in feet:
+                raise ConfigError(f"asset.foot_geoms: {unknown('foot', foot, feet, 'asset.foot_names')}")
+            if not geoms:
                 raise ConfigError(f"asset.foot_geoms: foot '{foot}' has no geom; name the geoms that touch the ground")
-        if self.commands.curriculum and not self.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
-            raise ConfigError(
-                "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
-            )
+        if commands.curriculum and not self.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
+            mend = "give rewards.scales.tracking_lin_vel a number above 0"
+            raise ConfigError(f"commands.curriculum goes by how well tracking_lin_vel is met: {mend}")

@@ -1,13 +1,12 @@
-"""The robot's mirror image as columns: what swapping left and right does to observations and actions.
+"""The robot's mirror image, left for right: a signed permutation of the columns of observations and actions.
 
-Made from the column ``mirror`` of the observation table, when ``RobotTask.mirror`` is first asked for; the step never
-asks. The mirror is the x-z plane: of the root for what is in the body's frame, of the world for what is in the
-world's. Both are one operation, so both follow the same formula.
+It is made from the column ``mirror`` of the observation table when ``RobotTask.mirror`` is first read; the step does
+not use it. The mirror is the x-z plane: the root's for values in the body frame, the world's for values in the world
+frame. Both have the same formula.
 
-An IMU beside the plane (Go1: 67 mm) does not change sides in the mirror. Its velocity in the mirrored motion is the
-mirrored velocity plus what turning adds over twice that distance, which is linear in the rates: kind "imu_velocity",
-and in the same way kind "command". The accelerometer would need the angular acceleration; it is mirrored as if it
-were in the plane. Joints and feet are checked; masses are not.
+An IMU beside the plane (Go1: 67 mm) does not change sides. Its mirrored velocity therefore has a second term, the
+angular velocity times twice that distance: kinds "imu_velocity" and "command". The accelerometer would need the angular
+acceleration, and is mirrored as if it were in the plane. Joints and feet are checked, masses are not.
 """
 
 from __future__ import annotations
@@ -33,15 +32,11 @@ class Block(NamedTuple):
 
     index: list[int]  # column that each is taken from
     sign: list[float]  # +1 or -1, times the ratio of the two columns' scales
-    # (to, from, factor): to the mirrored column, add factor * column, not mirrored
-    shifts: list[tuple[int, int, float]] = []
+    shifts: list[tuple[int, int, float]] = []  # (to, from, factor): mirrored column += factor * unmirrored column
 
 
 class Columns(NamedTuple):
-    """A signed permutation and shifts: ``x[:, index] * sign``, plus ``x[:, source] * factor`` in columns ``target``.
-
-    Done twice it gives ``x`` back.
-    """
+    """``x[:, index] * sign``, plus ``x[:, source] * factor`` in columns ``target``. Twice gives ``x`` back."""
 
     index: Tensor  # (size,) int64, column that this one is taken from
     sign: Tensor  # (size,) +1 or -1, where the columns of a pair have the same scale
@@ -58,33 +53,29 @@ class Columns(NamedTuple):
 
 
 class Mirror(NamedTuple):
-    """The mirror image of all that a policy sees and does."""
+    """The mirror image of a policy's observations and actions."""
 
     observations: dict[str, Columns]  # by group
     actions: Columns
 
 
 def make_mirror(groups: Mapping[str, Sequence[Row]], blocks: dict[str, Block], reach: float, device: str) -> Mirror:
-    """Read the table. ``blocks`` are the kinds of mirror image by name, ``reach`` [m] is from the mirrored IMU to the IMU.
+    """The mirror of the table's groups. ``blocks``: the kinds by name; ``reach`` [m]: from the mirrored IMU to the IMU.
 
     Raises ConfigError for a row that has no mirror image.
     """
-
-    def columns(block: Block) -> Columns:
-        # whatever mode the first caller is in: mirrored actions of a loss carry gradients
-        with torch.inference_mode(False):
-            target, source, factor = zip(*block.shifts, strict=True) if block.shifts else ((), (), ())
-            places = (
-                torch.tensor(list(where), dtype=torch.long, device=device) for where in (block.index, target, source)
-            )
-            numbers = (torch.tensor(list(values), dtype=torch.float, device=device) for values in (block.sign, factor))
-            (index, to, origin), (sign, by) = places, numbers
-            return Columns(index, sign, to, origin, by)
-
     blocks = dict(blocks)
     for group, rows in groups.items():
-        blocks[group] = _side_by_side(group, rows, blocks, reach)  # rows of later groups may contain this one
-    return Mirror({group: columns(blocks[group]) for group in groups}, columns(blocks["joint"]))
+        blocks[group] = _group_block(group, rows, blocks, reach)  # rows of later groups may contain this one
+    return Mirror({group: _columns(blocks[group], device) for group in groups}, _columns(blocks["joint"], device))
+
+
+def _columns(block: Block, device: str) -> Columns:
+    with torch.inference_mode(False):  # whatever mode the caller is in: mirrored actions of a loss carry gradients
+        index = torch.tensor(block.index, dtype=torch.long, device=device)
+        sign = torch.tensor(block.sign, dtype=torch.float, device=device)
+        target, source, factor = torch.tensor(block.shifts, dtype=torch.float, device=device).view(-1, 3).T.contiguous()
+        return Columns(index, sign, target.long(), source.long(), factor)
 
 
 def robot_blocks(partners: Partners) -> dict[str, Block]:
@@ -94,103 +85,89 @@ def robot_blocks(partners: Partners) -> dict[str, Block]:
         "scalar": Block([0], [1.0]),  # the same on both sides
         "polar": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # x, -y, z: a velocity, a force, a direction
         "axial": Block([0, 1, 2], [-1.0, 1.0, -1.0]),  # -x, y, -z: an angular velocity
-        # of the IMU, body frame; shifted by the row "base_ang_vel" beside it
-        "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),
+        "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # body frame; shifted by the row "base_ang_vel" beside it
         "joint": joints,  # a number a joint
-        "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # one that does not turn with the joint's axis
-        # the root's, then one a joint
-        "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),
+        "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # likewise, whatever the axis's direction
+        "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # root's, then joints'
     }
 
 
 def foot_blocks(partners: Partners) -> dict[str, Block]:
-    """Kinds of mirror image of what each foot has."""
+    """Kinds of mirror image for rows with a number, or a polar vector, for each foot."""
     feet = list(partners.sites)
-    return {
-        "foot": Block(feet, [1.0] * len(feet)),  # a number a foot
-        # a polar vector a foot
-        "foot_polar": Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),
-    }
+    polar = Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet))
+    return {"foot": Block(feet, [1.0] * len(feet)), "foot_polar": polar}
 
 
 def body_blocks(robot: RobotModel, partners: Partners, names: Sequence[str]) -> dict[str, Block]:
-    """Kinds of mirror image of what each of the bodies ``names`` has. Raises ConfigError for one without its partner.
+    """Kinds of mirror image for rows with a vector or a turn for each of the bodies ``names``.
 
-    A turn is the first two columns of a rotation matrix, row by row.
+    A turn is the first two columns of a rotation matrix, row by row. Raises ConfigError for a body without its partner.
     """
-    carried = [int(robot.physics.joint(name).bodyid[0]) for name in robot.joint_names]  # the body that each joint moves
+    model = robot.physics
+    carried = [int(model.joint(name).bodyid[0]) for name in robot.joint_names]  # the body that each joint moves
     bodies = [robot.id("body", name) for name in names]
     images = [carried[partners.joints[carried.index(body)]] if body in carried else body for body in bodies]
     for name, image in zip(names, images, strict=True):
         if image not in bodies:
-            other = robot.physics.body(image).name
-            raise ConfigError(
-                f"body '{name}' is compared and its mirror image '{other}' is not: name both, or {NO_MIRROR}"
-            )
-    places, polar, turn = [bodies.index(image) for image in images], [1.0, -1.0, 1.0], [1.0, -1.0, -1.0, 1.0, 1.0, -1.0]
+            what = f"body '{name}' is compared and its mirror image '{model.body(image).name}' is not"
+            raise ConfigError(f"{what}: name both, or {NO_MIRROR}")
+    places, turn = [bodies.index(image) for image in images], [1.0, -1.0, -1.0, 1.0, 1.0, -1.0]
     return {
         "turn": Block([*range(6)], turn),
-        "body_polar": Block([3 * b + k for b in places for k in range(3)], polar * len(places)),
+        "body_polar": Block([3 * b + k for b in places for k in range(3)], [1.0, -1.0, 1.0] * len(places)),
         "body_turn": Block([6 * b + k for b in places for k in range(6)], turn * len(places)),
     }
 
 
 def command_block(table: Sequence[Command], reach: float) -> Block:
-    """The commands left for right: of the velocity at the IMU vx, -vy and -yaw rate, of others what ``commands.mirror`` says."""
+    """The mirrored commands: vx, -vy, -yaw rate at the IMU; of other commands what ``commands.mirror`` states."""
     names = [command.name for command in table]
     for command in table:
         if command.mirror is None:
-            raise ConfigError(
-                f"commands.ranges.{command.name}: nothing says what a mirror does to it; "
-                f"write commands.mirror = {{'{command.name}': 1.0}}, or -1.0 if left and right change its sign, or {NO_MIRROR}"
-            )
+            what = f"commands.ranges.{command.name}: nothing says what a mirror does to it"
+            write = f"write commands.mirror = {{'{command.name}': 1.0}}, or -1.0 if left and right change its sign"
+            raise ConfigError(f"{what}; {write}, or {NO_MIRROR}")
     shifts = [(names.index("lin_vel_x"), names.index("ang_vel_yaw"), reach)] if {*VELOCITY} <= {*names} else []
     return Block(list(range(len(names))), [float(command.mirror or 1.0) for command in table], shifts)
 
 
 def scan_block(xs: Sequence[float], ys: Sequence[float]) -> Block:
-    """Points (x, y) in the order of the height scan: x stays, y changes its sign. Raises ConfigError for a lopsided grid."""
+    """The mirrored points (x, -y) of the height scan. Raises ConfigError for a lopsided grid."""
     if any(abs(left + right) > 1e-6 for left, right in zip(sorted(ys), sorted(ys, reverse=True), strict=True)):
-        raise ConfigError(
-            f"terrain.measured_points_y {list(ys)} is not its own mirror image; make it so, or {NO_MIRROR}"
-        )
+        what = f"terrain.measured_points_y {list(ys)} is not its own mirror image"
+        raise ConfigError(f"{what}; make it so, or {NO_MIRROR}")
     partner = [min(range(len(ys)), key=lambda j: abs(ys[j] + y)) for y in ys]
     return Block([i * len(ys) + j for i in range(len(xs)) for j in partner], [1.0] * (len(xs) * len(ys)))
 
 
 def check_pose(names: Sequence[str], pose: Sequence[float], partners: Partners) -> None:
-    """Action 0 is the default pose (D,) on both sides, so the pose must be its own mirror image. Raises ConfigError."""
+    """Raise ConfigError unless the default pose (D,) is its own mirror image: action 0 is that pose on both sides."""
     for i, (j, sign) in enumerate(zip(partners.joints, partners.signs, strict=True)):
         if abs(pose[i] - sign * pose[j]) > 1e-6:
             image = "its own mirror image" if i == j else f"the mirror image of {pose[j]:g} rad at '{names[j]}'"
-            raise ConfigError(
-                f"init_state.default_joint_angles: joint '{names[i]}' is at {pose[i]:g} rad, {image} is {sign * pose[j] + 0.0:g}; "
-                f"make the default pose symmetric, or {NO_MIRROR}"
-            )
+            what = f"joint '{names[i]}' is at {pose[i]:g} rad, {image} is {sign * pose[j] + 0.0:g}"
+            mend = f"make the default pose symmetric, or {NO_MIRROR}"
+            raise ConfigError(f"init_state.default_joint_angles: {what}; {mend}")
 
 
-def _side_by_side(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], reach: float) -> Block:
-    """The block of a whole group."""
-    whole = Block([], [], [])
-    starts: dict[str, int] = {}
+def _group_block(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], reach: float) -> Block:
+    """The block of a whole group: its rows' blocks side by side, with their scales."""
+    whole, starts = Block([], [], []), dict[str, int]()
     for row in rows:
         where = f"observation row '{row.name}' of '{group}'"
         if row.mirror is None:
-            raise ConfigError(
-                f"{where} does not say what a mirror does to it: give its Row a mirror=...; there are: {', '.join(blocks)}"
-            )
+            what = "does not say what a mirror does to it: give its Row a mirror=..."
+            raise ConfigError(f"{where} {what}; there are: {', '.join(blocks)}")
         if row.mirror not in blocks:
-            raise ConfigError(
-                f"{where}: {unknown('mirror', row.mirror, blocks, 'its Row (a group must come before what contains it)')}"
-            )
-        block = blocks[row.mirror]
-        times, rest = divmod(row.size, len(block.index))
-        if row.value.shape[1] % len(block.index) or rest:
-            raise ConfigError(
-                f"{where} has {row.value.shape[1]} columns; mirror='{row.mirror}' takes a multiple of {len(block.index)}"
-            )
+            place = "its Row (a group must come before what contains it)"
+            raise ConfigError(f"{where}: {unknown('mirror', row.mirror, blocks, place)}")
+        block, size = blocks[row.mirror], row.value.shape[1]
+        if size % len(block.index):
+            what = f"mirror='{row.mirror}' takes a multiple of {len(block.index)}"
+            raise ConfigError(f"{where} has {size} columns; {what}")
         starts[row.name] = len(whole.index)
-        for _ in range(times):
+        for _ in range(row.size // len(block.index)):
             start = len(whole.index)
             whole.index.extend(start + i for i in block.index)
             whole.sign.extend(block.sign)
@@ -198,32 +175,26 @@ def _side_by_side(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], 
     for row in rows if reach else ():
         if row.mirror == "imu_velocity":
             whole.shifts.extend(_imu_shifts(group, row, rows, starts, reach))
-    return _scaled(whole, [scale for row in rows for scale in row.column_scales() * row.history])
+    scale = [scale for row in rows for scale in row.column_scales() * row.history]
+    sign = [s * scale[i] / scale[j] for i, (j, s) in enumerate(zip(whole.index, whole.sign, strict=True))]
+    shifts = [(to, source, factor * scale[to] / scale[source]) for to, source, factor in whole.shifts]
+    return Block(whole.index, sign, shifts)
 
 
 def _imu_shifts(
     group: str, row: Row, rows: Sequence[Row], starts: Mapping[str, int], reach: float
 ) -> list[tuple[int, int, float]]:
-    """What turning adds to each frame of the IMU's velocity ``row``, from the same frame of the row "base_ang_vel"."""
+    """The second term of the IMU's velocity ``row``: each frame takes the same frame of the row "base_ang_vel"."""
     rates = next((each for each in rows if each.name == "base_ang_vel"), None)
     if rates is None:
-        raise ConfigError(
-            f"observation row '{row.name}' of '{group}' needs the row 'base_ang_vel' beside it, to be mirrored"
-        )
+        where = f"observation row '{row.name}' of '{group}'"
+        raise ConfigError(f"{where} needs the row 'base_ang_vel' beside it, to be mirrored")
     if rates.history < row.history:
-        raise ConfigError(
-            f"observations.history: '{group}.{row.name}' has {row.history} frames, so 'base_ang_vel' needs as many"
-        )
+        what = f"'{group}.{row.name}' has {row.history} frames, so 'base_ang_vel' needs as many"
+        raise ConfigError(f"observations.history: {what}")
     shifts = []
     for back in range(1, row.history + 1):  # frames are oldest first, so both are counted from the newest
         velocity = starts[row.name] + 3 * (row.history - back)
         rate = starts["base_ang_vel"] + 3 * (rates.history - back)
         shifts += [(velocity, rate + 2, reach), (velocity + 2, rate, -reach)]  # 2y wz in x, -2y wx in z
     return shifts
-
-
-def _scaled(block: Block, scale: list[float]) -> Block:
-    """The same mirror for columns that carry a scale each."""
-    sign = [s * scale[i] / scale[j] for i, (j, s) in enumerate(zip(block.index, block.sign, strict=True))]
-    shifts = [(to, source, factor * scale[to] / scale[source]) for to, source, factor in block.shifts]
-    return Block(block.index, sign, shifts)

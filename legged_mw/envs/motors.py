@@ -1,8 +1,8 @@
-"""Where a motor's torque comes from: the laws, with the scale, the delays and the encoders that stand between a policy and its motors.
+"""Where a motor's torque comes from: the motor laws, and the action scale, delays and encoders around them.
 
-``control.actuator`` is the law, or a task's own ``_compute_torques``. Servos, DC motors and plain torques are MuJoCo's actuators, with
-the gains, curves and force limits that ``sim/servos.py`` writes into the model. What changes within a control step is made here, by
-``Actuators.before``: networks, laws in code, and what arrives late. Shapes: N robots, D joints.
+``control.actuator`` is the law, or a task's own ``_compute_torques``. Servos, DC motors and plain torques are MuJoCo's
+actuators: ``sim/servos.py`` writes their gains, curves and force limits into the model. ``Actuators.before`` computes
+what changes within a control step: networks, laws in code, and late commands. Shapes: N robots, D joints.
 """
 
 from __future__ import annotations
@@ -25,93 +25,85 @@ from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
 from legged_mw.utils.motor_network import MotorNetwork, read_network
 
-# ---- laws: what each has, and what a config may say of it ------------------------------------------------------------
-
 OWN = "own"  # beside the names of ``control.actuator``: the law of a class with a _compute_torques of its own
-# factors of ``domain_rand`` on what a law may have
-FACTORS = ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")
+FACTORS = ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")  # of ``domain_rand``, on motors
 
 
 def own_law(cfg: RobotTaskCfg, task: str) -> str:
-    """OWN, for a class ``task`` that overrides ``_compute_torques``. Raises ConfigError for a config that chose another law."""
+    """OWN, for a class ``task`` that overrides ``_compute_torques``. Raises ConfigError if the config has a law too."""
     for field, default in (("actuator", "servo"), ("action_origin", "default")):
         if (value := getattr(cfg.control, field)) != default:
-            raise ConfigError(
-                f"control.{field} is {value!r}, but {task}._compute_torques is a motor law of its own: "
-                f"leave control.{field} out, or remove the method"
-            )
+            what = f"control.{field} is {value!r}, but {task}._compute_torques is a motor law of its own"
+            raise ConfigError(f"{what}: leave control.{field} out, or remove the method")
     return OWN
 
 
 def has_curve(cfg: RobotTaskCfg, law: str) -> bool:
-    """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` must, a servo never has one, others may."""
+    """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` always, a servo never, others by the config."""
     return law == "dc_motor" or (law != "servo" and bool(cfg.control.stall_torque or cfg.control.no_load_speed))
 
 
 def motor_drive(cfg: RobotTaskCfg, law: str) -> Drive:
-    """What drives the simulated motors under ``law``."""
+    """The input of the simulated motors under ``law``."""
     if law not in ("servo", "dc_motor"):
         return "torque"
     return "speed" if cfg.control.action_origin == "speed" else "angle"
 
 
-def motor_gains(cfg: RobotTaskCfg, law: str) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Stiffness and damping, tables a joint; zero where the law has none and the config is silent."""
+def motor_gains(cfg: RobotTaskCfg, law: str) -> dict[str, Mapping[str, float]]:
+    """The tables "stiffness" and "damping"; zeros where ``law`` has no such gain and the config gives none."""
     control, none = cfg.control, {"": 0.0} if law in ("torque", "network") else {}
     stiffness = {"": 0.0} if motor_drive(cfg, law) == "speed" else control.stiffness or none
-    return stiffness, control.damping or none
+    return {"stiffness": stiffness, "damping": control.damping or none}
 
 
 def motor_curves(cfg: RobotTaskCfg, law: str) -> Mapping[str, Mapping[str, float]]:
-    """The tables of the torque-speed curve, by the simulator's names for them; none without a curve."""
-    control = cfg.control
-    tables = {"stall_torque": control.stall_torque, "no_load_speed": control.no_load_speed, "gear": control.gear}
-    return tables if has_curve(cfg, law) else {}
+    """The tables of the torque-speed curve; none without a curve."""
+    tables = ("stall_torque", "no_load_speed", "gear") if has_curve(cfg, law) else ()
+    return {name: getattr(cfg.control, name) for name in tables}
 
 
 def factor_fields(cfg: RobotTaskCfg, law: str) -> dict[str, tuple[str, ...]]:
-    """Those of FACTORS that motors of ``law`` have -> fields of the model that they scale; a law in code reads its gains itself."""
+    """Those of FACTORS that motors of ``law`` have -> model fields that they scale; a law in code reads its gains."""
     fields: dict[str, tuple[str, ...]] = {"strength": ("actuator_forcerange",)}
     if law == "servo":
         fields |= {"stiffness": ("actuator_gainprm", "actuator_biasprm"), "damping": ("dof_damping",)}
     elif law == "dc_motor":
-        fields |= {"stiffness": ("actuator_gainprm",), "damping": ("actuator_gainprm",)}
+        fields |= dict.fromkeys(("stiffness", "damping"), ("actuator_gainprm",))
     elif law == OWN:
         fields |= {"stiffness": (), "damping": ()}
     if has_curve(cfg, law):
-        fields |= {"stall_torque": ("actuator_gainprm",), "no_load_speed": ("actuator_gainprm",)}
+        fields |= dict.fromkeys(("stall_torque", "no_load_speed"), ("actuator_gainprm",))
     if cfg.control.action_origin == "speed":
         fields.pop("stiffness", None)
     return fields
 
 
 def note_network(cfg: RobotTaskCfg) -> None:
-    """Write into the config which file its motors' network is; what a run was trained with stays."""
+    """Write the digest of the file ``control.network`` into the config, unless a training wrote it before."""
     control = cfg.control
     if control.actuator == "network" and control.network and control.network not in control.network_digest:
         control.network_digest = {control.network: digest(find_file(cfg, "control.network"))}
 
 
 def find_network(cfg: RobotTaskCfg) -> Path:
-    """The file ``control.network``. Raises ConfigError if it has changed since the training that the config is of."""
-    control, file = cfg.control, find_file(cfg, "control.network")
-    if control.network_digest.get(control.network) not in (None, found := digest(file)):
-        was = control.network_digest[control.network]
-        raise ConfigError(
-            f"control.network: {file} is not the file of that name that this run was trained with (SHA-256 {found[:8]}..., then "
-            f"{was[:8]}...); bring that one back, or take this one with --set control.network_digest={{}}"
-        )
+    """The file ``control.network``. Raises ConfigError if it has changed since the training."""
+    file = find_file(cfg, "control.network")
+    now = digest(file)
+    then = cfg.control.network_digest.get(cfg.control.network, now)
+    if now != then:
+        digests = f"(SHA-256 {now[:8]}..., then {then[:8]}...)"
+        what = f"{file} is not the file of that name that this run was trained with {digests}"
+        mend = "bring that one back, or take this one with --set control.network_digest={}"
+        raise ConfigError(f"control.network: {what}; {mend}")
     return file
 
 
-# ---- from actions to motor commands ----------------------------------------------------------------------------------
-
-
 class Actuators:
-    """Motors of N robots with D joints. An action means a target, origin + scale * action, or under the law "torque" scale * action.
+    """Motors of N robots with D joints. The target is origin + scale * action; under "torque" it is scale * action.
 
-    ``control.action_origin`` is the origin: "default" the default pose, "joints" the measured joint angles, "targets" the last targets;
-    with "speed" there is none, and targets are speeds [rad/s].
+    ``control.action_origin`` is the origin: "default" the default pose, "joints" the measured joint angles, "targets"
+    the last targets; with "speed" there is none, and targets are speeds [rad/s].
     """
 
     written = ("targets", "_sent", "_delay", "_late", "_network")
@@ -129,29 +121,30 @@ class Actuators:
         compute: Callable[[Tensor], Tensor],  # the task's ``_compute_torques``, for the law OWN
     ) -> None:
         self.law, self._origin, self._sim, self._drawn = law, cfg.control.action_origin, sim, drawn
-        self._default, self._dof_pos = default, sim.qpos[:, 7:]
+        self._default, self._dof_pos, self._compute = default, sim.qpos[:, 7:], compute
         scale = robot.tables["control.action_scale"]
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], [rad/s] or [N m]
-        self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
         self._gains = {name: torch.tensor(robot.tables[name], device=sim.device) for name in ("stiffness", "damping")}
         by_angle = law not in ("torque", OWN) and self._origin != "speed"
         self.encoder_offset = drawn.get("encoder_offset")  # (N, D) [rad], measured minus true angle
         self._offset = self.encoder_offset if by_angle else None
         self._start: Tensor | float = default if by_angle else 0.0  # targets of a new episode
-        self._delay = make_delay(cfg, "action_delay", drawn, len(scale), start=0.0)
-        self._late = _make_substep_delay(cfg, drawn, len(scale))
-        self._compute, self._network = compute if law == OWN else None, None
-        # (N, D) what is sent to the motors: targets less what their encoders are off, torques, or under OWN actions
+        self._delay: Delay | None = None
+        if "action_delay" in drawn:
+            self._delay = Delay(cfg, "action_delay", drawn["action_delay"], len(scale), start=0.0)
+        self._late = SubstepDelay(cfg, drawn["delay_ms"], len(scale)) if "delay_ms" in drawn else None
+        # (N, D) sent to the motors: targets minus encoder offsets, torques, or under OWN actions
         self._sent = sim.ctrl
         if self._late or law in ("network", OWN):
             self._sent, self.before = torch.zeros_like(sim.ctrl), self._before_substep
+        self._network: NetworkLaw | None = None
         if law == "network":
             self._network = NetworkLaw(read_network(find_network(cfg)), self._dof_pos, sim.qvel[:, 6:])
-        # (N, D) as the policy means them
+        # (N, D) by the encoders, as the policy means them
         self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)
 
     def sent(self) -> Tensor:
-        """(N, D) what was sent to the motors last, as the policy means it."""
+        """(N, D) The last motor commands, as the policy means them."""
         return self._sent if self._offset is None else self._sent + self._offset
 
     def gain(self, name: str) -> Tensor:
@@ -159,42 +152,44 @@ class Actuators:
         return self._gains[name] * self._drawn[name] if name in self._drawn else self._gains[name]
 
     def apply(self, actions: Tensor) -> None:
-        """Send the motors what ``actions`` (N, D) mean."""
-        late = self._delay(actions) if self._delay else actions
+        """Send the motors the commands of ``actions`` (N, D)."""
+        actions = self._delay(actions) if self._delay else actions
         if self.law == OWN:
-            self._sent.copy_(late)
+            self._sent.copy_(actions)
         elif self.law == "torque" or self._origin == "speed":
-            torch.mul(late, self.scale, out=self.targets)
+            torch.mul(actions, self.scale, out=self.targets)
         else:
-            self._aim(late)
+            torch.addcmul(self._origin_angles(), actions, self.scale, out=self.targets)
+            if self._offset is not None:
+                torch.sub(self.targets, self._offset, out=self._sent)
         if self._late:
             self._late(self._sent)
 
-    def _aim(self, actions: Tensor) -> None:
-        """Targets from ``actions`` (N, D)."""
-        origin = self._default
+    def _origin_angles(self) -> Tensor:
+        """(D,) or (N, D) [rad]."""
         if self._origin == "targets":
-            origin = self.targets
-        elif self._origin == "joints":
-            origin = self._dof_pos if self._offset is None else self._dof_pos + self._offset
-        if self._same_scale is None:
-            torch.addcmul(origin, actions, self.scale, out=self.targets)
-        else:
-            torch.add(origin, actions, alpha=self._same_scale, out=self.targets)
-        if self._offset is not None:
-            torch.sub(self.targets, self._offset, out=self._sent)
+            return self.targets
+        if self._origin == "joints":
+            return self._dof_pos if self._offset is None else self._dof_pos + self._offset
+        return self._default
 
     def _before_substep(self, k: int) -> None:
-        """Write ``ctrl`` for substep ``k``."""
+        """Write ``ctrl`` for substep ``k``. Raises ConfigError if a law in code returns no torque a joint."""
         sent = self._late.arriving[k] if self._late else self._sent
         if self._network:
             sent = self._network(sent)
-        elif self._compute:
-            sent = _checked(self._compute(sent), self._compute, sent)
+        elif self.law == OWN:
+            torques: Any = self._compute(sent)
+            if not isinstance(torques, Tensor) or torques.shape != sent.shape:
+                name = getattr(self._compute, "__qualname__", "_compute_torques")
+                found = (*torques.shape,) if isinstance(torques, Tensor) else f"{torques!r:.40}"
+                what = f"must return a tensor {tuple(sent.shape)}, a torque a joint"
+                raise ConfigError(f"{name} {what}; it returned {found}")
+            sent = torques
         self._sim.ctrl.copy_(sent)
 
     def reset(self, mask: Tensor) -> None:
-        """Targets at the default pose, or torques and speeds zero, where ``mask`` (N,) is true; of delays and networks nothing is left."""
+        """Where ``mask`` (N,) is true: targets at the default pose, torques and speeds 0, delays and networks empty."""
         assign(self.targets, mask, self._start)
         if self._offset is not None:
             assign(self._sent, mask, self._default - self._offset)
@@ -205,17 +200,6 @@ class Actuators:
         if self._network:
             self._network.reset(mask)
 
-
-def _checked(torques: Any, law: Callable[[Tensor], Tensor], actions: Tensor) -> Tensor:
-    """What a law in code returned for ``actions``. Raises ConfigError if it is not a torque a joint."""
-    if isinstance(torques, Tensor) and torques.shape == actions.shape:
-        return torques
-    name = getattr(law, "__qualname__", "_compute_torques")
-    found = (*torques.shape,) if isinstance(torques, Tensor) else f"{torques!r:.40}"
-    raise ConfigError(f"{name} must return a tensor {tuple(actions.shape)}, a torque a joint; it returned {found}")
-
-
-# ---- networks --------------------------------------------------------------------------------------------------------
 
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "elu": torch.nn.functional.elu,
@@ -228,16 +212,14 @@ _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 class NetworkLaw:
     """A network as the motors of all joints: ``law(targets)`` is called before each substep, and recorded with it.
 
-    It computes in float32, however coarse the learner's matrix products are on a GPU (``runner.matmul_precision``).
+    It computes in float32, whatever the precision of the learner's matrix products (``runner.matmul_precision``).
     """
 
     written = ("_past", "_memory")
 
     def __init__(self, network: MotorNetwork, angle: Tensor, speed: Tensor) -> None:
-        """Joint angles [rad] and speeds [rad/s] (N, D) are read at each call."""
-        self._angle, self._speed, (robots, joints) = angle, speed, angle.shape
-        self._activation, self._in_turns = network.activation, network.in_turns
-        self._scales = network.error_scale, network.speed_scale, network.torque_scale
+        """Each call reads the joint angles [rad] and speeds [rad/s], (N, D)."""
+        self._network, self._angle, self._speed, (robots, joints) = network, angle, speed, angle.shape
 
         def tensor(weights: Any) -> Tensor:
             return torch.tensor(weights, device=angle.device)
@@ -252,17 +234,17 @@ class NetworkLaw:
 
     def __call__(self, targets: Tensor) -> Tensor:
         """Torques (N, D) [N m] from ``targets`` (N, D) [rad]."""
-        past, (error_scale, speed_scale, torque_scale) = self._past, self._scales
+        past, network = self._past, self._network
         past[1:] = past[:-1].clone()
-        past[0, 0] = error_scale * (targets - self._angle)
-        past[0, 1] = speed_scale * self._speed
+        past[0, 0] = network.error_scale * (targets - self._angle)
+        past[0, 1] = network.speed_scale * self._speed
         frames = past.index_select(0, self._frames).permute(2, 3, 1, 0)  # (N, D, 2, F)
-        x = (frames.mT if self._in_turns else frames).flatten(2).flatten(0, 1)  # (N D, 2 F)
+        x = (frames.mT if network.in_turns else frames).flatten(2).flatten(0, 1)  # (N D, 2 F)
         precision = torch.get_float32_matmul_precision()
         torch.set_float32_matmul_precision("highest")
         torque = self._evaluate(x)
         torch.set_float32_matmul_precision(precision)
-        return (torque_scale * torque).view_as(targets)
+        return (network.torque_scale * torque).view_as(targets)
 
     def _evaluate(self, x: Tensor) -> Tensor:
         for memory, weights in zip(self._memory, self._recurrent, strict=True):
@@ -271,27 +253,27 @@ class NetworkLaw:
         for layer, (weight, bias) in enumerate(self._linear):
             x = torch.nn.functional.linear(x, weight, bias)
             if layer < len(self._linear) - 1:
-                x = _ACTIVATIONS[self._activation](x)
+                x = _ACTIVATIONS[self._network.activation](x)
         return x
 
     def reset(self, mask: Tensor) -> None:
-        """Where ``mask`` (N,) is true nothing was ever off its target."""
+        """Forget the past errors, speeds and memory where ``mask`` (N,) is true."""
         self._past.masked_fill_(mask[:, None], 0.0)
         for memory in self._memory:
             memory.unflatten(1, (len(mask), -1)).masked_fill_(mask[:, None, None], 0.0)
 
 
-# ---- delays ----------------------------------------------------------------------------------------------------------
-
-
 class Delay:
-    """``delay(now)``, called once a step with a value (N, width), returns the value of d steps ago; each world has its own d."""
+    """``delay(now)``, called once a step with a value (N, width), returns that of d steps ago; each world has its d."""
 
     written = ("past", "_new")
 
-    def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
-        """``steps`` (N, 1) is read at each call. Before an episode the value was ``start``; None: the episode's first value."""
-        self.steps, self.start = steps, start
+    def __init__(self, cfg: RobotTaskCfg, name: str, steps: Tensor, width: int, start: float | None = None) -> None:
+        """Each call reads ``steps`` (N, 1), drawn by ``domain_rand.<name>``. Before an episode the value was ``start``;
+        None: the episode's first one.
+        """
+        self.steps, self.start, longest = steps, start, int(getattr(cfg.domain_rand, name)[1])
+        _require_memory(cfg, name, steps, longest + 1, width)
         self.past = torch.zeros(len(steps), longest + 1, width, device=steps.device)  # newest first
         self._new = torch.ones(len(steps), dtype=torch.bool, device=steps.device)
 
@@ -313,26 +295,26 @@ class Delay:
 
 
 class SubstepDelay:
-    """Motor commands, sent once a control step, arrive late by whole simulation steps; each world has its own delay.
+    """Delays motor commands, sent once a control step, by whole simulation steps; each world has its own delay.
 
-    A command with a delay of d steps arrives before substep d of those that follow. 7 ms in steps of 4 ms, the nearest being
-    d = 2: physics from t + 8 ms on uses what is sent at t.
+    A command with a delay of d steps arrives before substep d of those that follow. For example, 7 ms in steps of 4 ms
+    is d = 2: physics from t + 8 ms on uses the command sent at t.
     """
 
     written = ("_past", "arriving")
 
-    def __init__(self, delay: Tensor, step_ms: float, longest: float, substeps: int, width: int) -> None:
-        """``delay`` (N, 1) [ms], whole steps of ``step_ms`` and at most ``longest``, is read at each call."""
-        self._delay, self._step_ms = delay, step_ms
-        # newest first
-        self._past = torch.zeros(
-            math.ceil(round(longest / step_ms) / substeps) + 1, len(delay), width, device=delay.device
-        )
+    def __init__(self, cfg: RobotTaskCfg, delay: Tensor, width: int) -> None:
+        """Each call reads ``delay`` (N, 1) [ms], whole simulation steps within ``domain_rand.delay_ms``."""
+        self._delay, self._step_ms, substeps = delay, 1e3 * cfg.sim.dt, cfg.control.decimation
+        longest = round_delay(cfg.domain_rand.delay_ms[1], self._step_ms) / self._step_ms  # [simulation steps]
+        _require_memory(cfg, "delay_ms", delay, longest / substeps + 1, width)
+        frames = math.ceil(round(longest) / substeps) + 1
+        self._past = torch.zeros(frames, len(delay), width, device=delay.device)  # newest first
         self._substep = torch.arange(substeps, device=delay.device)[:, None, None]
         self.arriving = torch.zeros(substeps, len(delay), width, device=delay.device)  # in each substep
 
     def restart(self, mask: Tensor, sent: Tensor) -> None:
-        """Where ``mask`` (N,) is true ``sent`` (N, width) is all that was ever sent."""
+        """Fill the past with ``sent`` (N, width) where ``mask`` (N,) is true."""
         self._past.copy_(torch.where(mask[:, None], sent, self._past))
 
     def __call__(self, sent: Tensor) -> None:
@@ -346,29 +328,8 @@ class SubstepDelay:
 
 
 def round_delay(delay: Any, step_ms: float) -> Any:
-    """[ms], a number or a tensor, to the nearest whole number of simulation steps, a half up."""
+    """``delay`` [ms], a number or a tensor, rounded to whole simulation steps, a half up."""
     return (delay / step_ms + 0.5) // 1.0 * step_ms
-
-
-def make_delay(
-    cfg: RobotTaskCfg, name: str, drawn: Mapping[str, Tensor], width: int, start: float | None = None
-) -> Delay | None:
-    """The delay line of ``action_delay`` or ``observation_delay`` [control steps], or None if the config has none."""
-    if name not in drawn:
-        return None
-    longest = int(getattr(cfg.domain_rand, name)[1])
-    _require_memory(cfg, name, drawn[name], longest + 1, width)
-    return Delay(drawn[name], longest, width, start)
-
-
-def _make_substep_delay(cfg: RobotTaskCfg, drawn: Mapping[str, Tensor], width: int) -> SubstepDelay | None:
-    """Likewise of ``delay_ms``."""
-    if "delay_ms" not in drawn:
-        return None
-    step_ms, substeps = 1e3 * cfg.sim.dt, cfg.control.decimation
-    longest = round_delay(cfg.domain_rand.delay_ms[1], step_ms)
-    _require_memory(cfg, "delay_ms", drawn["delay_ms"], longest / step_ms / substeps + 1, width)
-    return SubstepDelay(drawn["delay_ms"], step_ms, longest, substeps, width)
 
 
 def _require_memory(cfg: RobotTaskCfg, name: str, delays: Tensor, frames: float, width: int) -> None:

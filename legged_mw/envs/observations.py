@@ -1,4 +1,4 @@
-"""Observations from a task's table of rows: sizes, noise, scale, delay, history and order, all from the table and built once."""
+"""Observations from a task's table of rows. Sizes, noise, scale, delay, history and order all come from the table."""
 
 from __future__ import annotations
 
@@ -23,16 +23,15 @@ class Row(NamedTuple):
     name: str
     value: Tensor  # (N, size), a buffer that the step writes in place
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
-    # its mirror image, left for right: a kind of envs/mirror.py, or a group; None: not stated
-    mirror: str | None = None
+    mirror: str | None = None  # its mirror image: a kind of envs/mirror.py, or a group; None: not stated
     scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
-    measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
-    # how a robot measures it, for the exported policy; legged_mw/deploy/contract.py knows the rows of RobotTask by their names
-    sensors: tuple[str, ...] = ()  # sensors of the MJCF, whose values side by side are the row
+    measured: bool = False  # it comes from a sensor of the robot, so domain_rand.observation_delay applies to it
+    # For an exported policy, how a robot measures it (legged_mw/deploy/contract.py knows RobotTask's rows by name):
+    sensors: tuple[str, ...] = ()  # names of sensors in the MJCF; their values side by side are the row
     unit: str = ""
     frame: str = ""
-    history: int = 1  # frames that the policy sees, oldest first; from section `observations`
-    group: str = ""  # the group that this row is, if it is one
+    history: int = 1  # frames that the policy sees, oldest first; from `observations.history`
+    group: str = ""  # the group that this row contains, if it is one
 
     @property
     def size(self) -> int:
@@ -40,40 +39,35 @@ class Row(NamedTuple):
         return self.value.shape[1] * self.history
 
     def column_scales(self) -> list[float]:
-        """The scale of each column of ``value``; raises ConfigError where there is not one for each."""
+        """The scale of each column of ``value``. Raises ConfigError unless there is one scale, or one a column."""
         size = self.value.shape[1]
-        if isinstance(self.scale, tuple) and len(self.scale) != size:
-            raise ConfigError(
-                f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column"
-            )
-        return list(self.scale) if isinstance(self.scale, tuple) else [float(self.scale)] * size
+        if not isinstance(self.scale, tuple):
+            return [float(self.scale)] * size
+        if len(self.scale) != size:
+            what = f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales"
+            raise ConfigError(f"{what}; give one, or one a column")
+        return list(self.scale)
 
 
 def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
-    """The table that the method ``observation_rows`` returns, if all of it is of the kind that it must be: ``count`` worlds a row.
-
-    Raises StepError with the method's place.
-    """
+    """The table of the method ``observation_rows``, of ``count`` worlds. Raises StepError if it has another form."""
     table, where = make_rows(), place_of(make_rows)
     if not isinstance(table, Mapping) or not all(isinstance(rows, list | tuple) and rows for rows in table.values()):
         raise StepError(f"must return group -> list of rows; it returned {type(table).__name__}", where)
     for group, row in [(group, row) for group, rows in table.items() for row in rows if not isinstance(row, str)]:
         if not isinstance(row, Row):
-            raise StepError(
-                f"group '{group}' holds {type(row).__name__}; write Row(name, value, ...), or the name of a group",
-                where,
-            )
+            what = f"group '{group}' holds {type(row).__name__}"
+            raise StepError(f"{what}; write Row(name, value, ...), or the name of a group", where)
         value = row.value
         if not isinstance(value, Tensor) or value.dim() != 2 or len(value) != count or not value.numel():
             got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-            raise StepError(
-                f"row '{row.name}' of '{group}' is {got}; it must be a tensor ({count}, size), a row a world", where
-            )
+            wanted = f"a tensor ({count}, size), a row a world"
+            raise StepError(f"row '{row.name}' of '{group}' is {got}; it must be {wanted}", where)
     return table
 
 
 class Observations:
-    """The observation groups of N worlds. ``groups`` are the rows of each, ``buffers[group]`` (N, size) what the policy sees."""
+    """The observation groups of N worlds: ``groups[group]`` are its rows, ``buffers[group]`` (N, size) its values."""
 
     written = ("_parts",)
 
@@ -84,9 +78,9 @@ class Observations:
         noise_level: float,
         num_envs: int,
         device: str,
-        make_delay: Callable[[int], Delay | None],
+        make_delay: Callable[[int], Delay] | None = None,
     ) -> None:
-        """``table`` is what ``observation_rows`` returned; ``make_delay(width)`` gives a group its delay, or None."""
+        """``table`` is that of ``observation_rows``; ``make_delay(width)`` makes the delay of measured rows."""
         self.groups: dict[str, list[Row]] = {}
         self.buffers: dict[str, Tensor] = {}
         self._parts: dict[str, _Group] = {}
@@ -97,30 +91,30 @@ class Observations:
             frames = {row.name: cfg.history.get(f"{group}.{row.name}", cfg.history.get(group, 1)) for row in rows}
             self.groups[group] = [row._replace(history=frames[row.name]) for row in rows]
             part = _Group(group, self.groups[group], noise_level, num_envs, device)
-            if any(row.measured for row in rows):
+            if make_delay and any(row.measured for row in rows):
                 part.delay = make_delay(part.frame.shape[1])
             self._parts[group], self.buffers[group] = part, part.buffer
 
     def attach(self, other: Observations, group: str, name: str) -> None:
-        """Show ``group`` of ``other``, made of the same worlds, as the group ``name``; from now on ``other`` is computed here."""
-        read = {group}
+        """Add ``group`` of ``other``, Observations of the same worlds, as ``name``; ``compute`` now updates it too."""
+        needed = {group}
         for each in reversed(other.groups):  # a group comes after those that it contains
-            read |= {row.group for row in other.groups[each] if each in read}
-        self._parts |= {f"{name}/{each}": part for each, part in other._parts.items() if each in read}
+            needed |= {row.group for row in other.groups[each] if each in needed}
+        self._parts |= {f"{name}/{each}": part for each, part in other._parts.items() if each in needed}
         self.groups[name], self.buffers[name] = other.rows(group), other.buffers[group]
 
     def rows(self, group: str) -> list[Row]:
-        """The rows of ``group`` in order; a row that is a group is written out."""
+        """The rows of ``group`` in order, with those of the groups that it contains."""
         plain = [[row] if not row.group or row.history > 1 else self.rows(row.group) for row in self.groups[group]]
         return [row for rows in plain for row in rows]
 
     def compute(self) -> None:
-        """Fill the buffers: rows side by side, plus noise, times scale, as late as they are measured, with their history."""
+        """Fill the buffers: rows side by side, plus noise, times scale, delayed, with their history."""
         for part in self._parts.values():
             part.compute()
 
     def restart(self, mask: Tensor) -> None:
-        """An episode begins where ``mask`` (N,) is true: no delayed value and no frame of the last one is seen in it."""
+        """An episode begins where ``mask`` (N,) is true: forget delayed values and frames of the last one."""
         for part in self._parts.values():
             if part.delay:
                 part.delay.restart(mask)
@@ -128,15 +122,15 @@ class Observations:
                 part.fresh.logical_or_(mask)
 
     def nonfinite(self) -> list[NonFinite]:
-        """What counts values of rows that are not finite, a group each."""
+        """The counters of bad values, one a group."""
         return [part.nonfinite for part in self._parts.values()]
 
     def remember(self) -> list[tuple[Tensor, Tensor]]:
-        """Everything that ``compute`` changes, and copies of it."""
+        """All tensors that ``compute`` writes, with copies."""
         return [(tensor, tensor.clone()) for part in self._parts.values() for tensor in part.memory()]
 
     def recall(self, before: list[tuple[Tensor, Tensor]], mask: Tensor) -> None:
-        """Put back what ``remember`` returned, in the worlds where ``mask`` (N,) is true."""
+        """Restore the copies of ``remember`` in the worlds where ``mask`` (N,) is true."""
         for tensor, copy in before:
             assign(tensor, mask, copy)
 
@@ -156,11 +150,10 @@ class Observations:
         return slice(whole.stop - size, whole.stop)
 
     def _group_row(self, group: str, name: str) -> Row:
-        """A group as a row of another: the same noisy sample."""
+        """The group ``name`` as a row of ``group``: the same noisy sample."""
         if name not in self.buffers:
-            raise ConfigError(
-                f"observation group '{group}': {unknown('group', name, self.buffers, 'the groups that come before it')}"
-            )
+            place = "the groups that come before it"
+            raise ConfigError(f"observation group '{group}': {unknown('group', name, self.buffers, place)}")
         return Row(name, self.buffers[name], mirror=name, group=name)
 
 
@@ -170,35 +163,27 @@ class _Group:
     written = ("fresh", "frame", "buffer", "delay", "nonfinite")
 
     def __init__(self, name: str, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
-        noise = [row.noise * noise_level for row in rows for _ in range(row.value.shape[1])]
+        sizes, spans = [row.value.shape[1] for row in rows], [row.size for row in rows]
+        each = [row for row, size in zip(rows, sizes, strict=True) for _ in range(size)]  # the row of each column
+        noise = [row.noise * noise_level for row in each]
         scales = [scale for row in rows for scale in row.column_scales()]
         self._values = [row.value for row in rows]
         self._noise = torch.tensor(noise, device=device) if any(noise) else None
         self._scales = torch.tensor(scales, device=device) if any(scale != 1.0 for scale in scales) else None
-        self._measured = torch.tensor([row.measured for row in rows for _ in range(row.value.shape[1])], device=device)
+        self._measured = torch.tensor([row.measured for row in each], device=device)
         self.delay: Delay | None = None
-        self.nonfinite = NonFinite(
-            [f"observation row '{row.name}' of '{name}'" for row in rows for _ in range(row.value.shape[1])], device
-        )
+        self.nonfinite = NonFinite([f"observation row '{row.name}' of '{name}'" for row in each], device)
         self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
-        self.frame = torch.zeros(num_envs, len(noise), device=device)  # the newest frame of each row
+        self.frame = torch.zeros(num_envs, len(each), device=device)  # the newest frame of each row
         self.buffer = self.frame
-        # frames (N, F, size) in the buffer, newest (N, size) in the frame
-        self.histories: list[tuple[Tensor, Tensor]] = []
+        self.histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, (N, size) in the frame
         if any(row.history > 1 for row in rows):
             long = max(rows, key=lambda row: row.size)
             what = f"observations.history of '{long.name}' = {long.history}"
-            require_memory(
-                4 * num_envs * sum(row.size for row in rows), device, what, "each frame is kept in each world"
-            )
-            self.buffer = torch.zeros(num_envs, sum(row.size for row in rows), device=device)
-            spans = (
-                self.buffer.split([row.size for row in rows], dim=1),
-                self.frame.split([row.value.shape[1] for row in rows], dim=1),
-            )
-            self.histories = [
-                (all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)
-            ]
+            require_memory(4 * num_envs * sum(spans), device, what, "each frame is kept in each world")
+            self.buffer = torch.zeros(num_envs, sum(spans), device=device)
+            views = zip(rows, self.buffer.split(spans, dim=1), self.frame.split(sizes, dim=1), strict=True)
+            self.histories = [(frames.unflatten(1, (row.history, -1)), new) for row, frames, new in views]
 
     def compute(self) -> None:
         torch.cat(self._values, dim=1, out=self.frame)
@@ -217,7 +202,7 @@ class _Group:
             self.fresh.fill_(False)
 
     def memory(self) -> Iterator[Tensor]:
-        """All that ``compute`` writes."""
+        """All tensors that ``compute`` writes."""
         yield self.frame
         if self.histories:
             yield self.buffer
@@ -226,11 +211,8 @@ class _Group:
 
 
 def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCfg.observations]) -> None:
-    """Every group and row that the section ``observations`` names is in the table. Raises ConfigError."""
-    names = {
-        group: [entry if isinstance(entry, str) else entry.name for entry in entries]
-        for group, entries in table.items()
-    }
+    """Raise ConfigError for two rows of a name, and for a group or row in the config that does not exist."""
+    names = {group: [row if isinstance(row, str) else row.name for row in rows] for group, rows in table.items()}
     for group, rows in names.items():
         if twice := [name for name in rows if rows.count(name) > 1]:
             raise ConfigError(f"observation group '{group}' has two rows '{twice[0]}': give each a name of its own")
@@ -242,13 +224,9 @@ def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCf
                 raise ConfigError(f"observations.leave_out: {unknown('row', row, names[group], repr(group))}")
         if {*left} == {*names[group]}:
             raise ConfigError(f"observations.leave_out: '{group}' has no row left; leave one in")
-    for where, frames in cfg.history.items():
+    for where in cfg.history:
         group, _, row = where.partition(".")
         if group not in names:
             raise ConfigError(f"observations.history: {unknown('group', group, names, 'the observation table')}")
         if row and (row not in names[group] or row in cfg.leave_out.get(group, [])):
             raise ConfigError(f"observations.history: {unknown('row', row, names[group], repr(group))}")
-        if frames < 1:
-            raise ConfigError(
-                f"observations.history['{where}'] is {frames}; it must be 1 (the newest frame alone) or more"
-            )

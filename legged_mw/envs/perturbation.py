@@ -23,53 +23,42 @@ class Perturbation:
     ) -> None:
         """``mass`` [kg] of the robot, ``dt`` [s] of a control step."""
         self.cfg, self._sim, self._root, self._mass, self._dt = cfg, sim, root_body, mass, dt
-        device = sim.device
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float) -> Tensor:
-            return torch.zeros(sim.num_envs, *shape, dtype=dtype, device=device)
-
+        n, device = sim.num_envs, sim.device
         spans = [cfg.interval, cfg.duration, [-math.pi, math.pi], cfg.velocity]
         self._ranges = torch.tensor(spans, dtype=torch.float, device=device).T.contiguous()  # (2, 4)
-        # pause, duration [control steps], direction [rad], dv [m/s]; [control steps]
-        self._kick, self._clock = zeros(4), zeros()
-        self.kick_force = zeros(3)  # (N, 3) on the root, world frame [N]
-        self.kick_active = zeros(dtype=torch.bool)  # (N,)
-        # (N,) share of the range of dv that is drawn from
-        self.kick_level = zeros().fill_(0.0 if cfg.curriculum else 1.0)
-        # () share of dv that a training has come to
+        self._kick = torch.zeros(n, 4, device=device)  # pause, duration [control steps], direction [rad], dv [m/s]
+        self._clock = torch.zeros(n, device=device)  # [control steps] since the draw
+        self.kick_force = torch.zeros(n, 3, device=device)  # (N, 3) on the root, world frame [N]
+        self.kick_active = torch.zeros(n, dtype=torch.bool, device=device)  # (N,)
+        # (N,) share of the range of dv that draws come from
+        self.kick_level = torch.full((n,), 0.0 if cfg.curriculum else 1.0, device=device)
+        # () share of dv that ``perturbation.growth`` has reached
         self.growth: Tensor | float = torch.ones((), device=device) if cfg.growth else 1.0
-        interval = cfg.push_interval_s / dt
-        self._push_clock = zeros().uniform_(0.0, interval).round_() if cfg.push else zeros()  # [control steps] to go
+        self._push_clock = torch.zeros(n, device=device)  # [control steps] to the next push
+        if cfg.push:
+            self._push_clock.uniform_(0.0, cfg.push_interval_s / dt).round_()
 
     def apply(self) -> None:
-        """What disturbs the robots in this step."""
+        """Disturb the robots in this step."""
         if self.cfg.kick:
             self._kick_robots()
         if self.cfg.push:
             self._push_robots()
 
     def anneal(self, done: float) -> None:
-        """A training is ``done`` so far, from 0 to 1: kicks grow between the shares ``growth`` of it."""
+        """Let kicks grow with the share ``done`` (0 to 1) of a training, between the shares ``perturbation.growth``."""
         if isinstance(self.growth, Tensor):
             self.growth.fill_(float(np.interp(done, self.cfg.growth, [0.0, 1.0])))
 
     def update_level(self, mask: Tensor, survived: Tensor) -> None:
-        """Where ``mask`` (N,) is true: go from the level so far towards the share of an episode that was ``survived`` (N,).
-
-        A negative share leaves the level as it is.
-        """
-        assign(
-            self.kick_level, mask & (survived >= 0.0), torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate)
-        )
+        """Move levels towards the share ``survived`` (N,) of an episode, where ``mask`` (N,) is true."""
+        assign(self.kick_level, mask, torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate))
 
     def statistics(self) -> dict[str, Tensor]:
-        """The mean level of the kicks, where a curriculum raises it: (2,) a sum and what to divide it by."""
+        """With a curriculum the kicks' mean level: (2,) a sum and what to divide it by."""
         level = self.kick_level
-        return (
-            {"kick_level": torch.stack([level.sum(), torch.full_like(level[0], len(level))])}
-            if self.cfg.curriculum
-            else {}
-        )
+        mean = torch.stack([level.sum(), torch.full_like(level[0], len(level))])
+        return {"kick_level": mean} if self.cfg.curriculum else {}
 
     def reset(self, mask: Tensor) -> None:
         """An episode begins where ``mask`` (N,) is true."""
@@ -79,7 +68,7 @@ class Perturbation:
             self.kick_force.masked_fill_(mask[:, None], 0.0)
 
     def _kick_robots(self) -> None:
-        """After a pause, a half sine of force in a horizontal direction; then all is drawn again."""
+        """Apply a half sine of horizontal force after a pause, then draw the next kick."""
         wait, steps, angle, speed = self._kick.unbind(dim=1)
         elapsed = self._clock - wait
         self.kick_active.copy_((elapsed >= 0.0) & (elapsed < steps))
@@ -102,7 +91,7 @@ class Perturbation:
         self._clock.masked_fill_(mask, 0.0)
 
     def _push_robots(self) -> None:
-        """Where a clock has run down the root's horizontal velocity becomes a random one. [L]"""
+        """Give the root a random horizontal velocity where its clock has run down. [L]"""
         self._push_clock.sub_(1.0)
         due = self._push_clock <= 0.0
         if maybe_any(due):

@@ -1,14 +1,14 @@
-"""What every robot does in every task: act, sense, end, reset, observe, be rewarded. Read top to bottom; no simulator import.
+"""What every robot does in every task: act, sense, end, reset, observe, be rewarded. Read top to bottom.
 
-Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
-the host. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on
-by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are at the end.
-What the policy sees is a table of rows, ``observation_rows``: the only place that states the layout.
+Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no host reads.
+Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on by a number of
+that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are at the end. ``observation_rows`` is
+the table of what the policy sees: the only place that states the layout.
 
-Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (contacts,
-places and velocities of sites, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
+Freshness: ``qpos``, ``qvel`` and what is computed from them are current. Sensor values (contacts, places and velocities
+of sites, accelerometer, joint torque) are one simulation step old, and zero in a world just reset.
 
-Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym, which is legged_gym for Unitree's robots;
+Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym, legged_gym for Unitree's robots;
 [UL] unitree_rl_lab; [I] Isaac Lab; [M] mjlab; [HIM] HIMLoco.
 """
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from fnmatch import fnmatchcase
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,7 +28,7 @@ from torch import Tensor
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.domain_rand import DomainRand, check_draws, world_fields
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
-from legged_mw.envs.motors import Actuators, make_delay, motor_curves, motor_drive, motor_gains, own_law
+from legged_mw.envs.motors import Actuators, Delay, motor_curves, motor_drive, motor_gains, own_law
 from legged_mw.envs.observations import Observations, Row, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -54,21 +54,20 @@ FIELDS = {  # parameter of build_model, or table of it -> the field that it come
 
 
 class RobotTask(BaseTask):
-    """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
+    """N robots in N worlds, as one vectorized environment. A task is a subclass with its rewards and rows."""
 
     cfg: RobotTaskCfg
     exam = ""  # kind of exam that grades a policy (legged_mw/eval/exams.py); none
-    command_table: tuple[Command, ...] = ()  # what a person can ask of the robot; nothing
+    command_table: tuple[Command, ...] = ()  # commands that a person can give the robot; none
     commands: Tensor  # (N, C), in the order of command_table; only where that is not empty
-
-    # term -> what is sensed for it where it is on; `asset.sense` names more
+    # reward term -> value that the simulator senses where the term is on; `asset.sense` adds others
     SENSED_FOR: ClassVar[Mapping[str, str]] = {"self_collision": SELF_CONTACT, "angular_momentum": ANGULAR_MOMENTUM}
 
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
         """Each line needs those above it.
 
-        The robot is loaded on its ground, with the sensors that its terms read; draws need the simulation's fields; buffers are
-        views of the simulation; rows are buffers; each reward term is tried once, so all that it reads is there before.
+        Loading the robot needs its ground and the sensors of its terms; draws need the simulation's fields; buffers are
+        views of the simulation; rows are buffers; each reward term is tried once, so all that it reads must exist.
         """
         self.cfg = cfg
         law = self.motor_law
@@ -94,9 +93,8 @@ class RobotTask(BaseTask):
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_ranges()
         self._init_buffers()
-        self.perturbation = self.remember(
-            Perturbation(cfg.perturbation, self.sim, self.root_body, self.total_mass, self.dt)
-        )
+        perturbation = Perturbation(cfg.perturbation, self.sim, self.root_body, self.total_mass, self.dt)
+        self.perturbation = self.remember(perturbation)
         self._prepare_observations()
         self._prepare_reward_function()
         self.domain_rand.redraw()
@@ -124,17 +122,18 @@ class RobotTask(BaseTask):
         self.actuators.apply(self.actions)
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
-        """Torques (N, D) [N m] from ``actions`` (N, D), clipped and delayed; held to the force limits afterwards.
+        """Torques (N, D) [N m] from clipped, delayed ``actions`` (N, D); the force limits are applied afterwards.
 
-        The motors have the law ``control.actuator``; an override is a law of its own (envs/motors.py), called before every simulation
-        step and recorded with it. This one is legged_gym's position law.
+        It runs only in a class that overrides it, before every simulation step: the override is then the motors' law.
+        Without an override the law is ``control.actuator``, by default MuJoCo's servo (envs/motors.py). This method is
+        legged_gym's position law, for ``super()._compute_torques(actions)``.
         """
         target = self.default_dof_pos + self.actuators.scale * actions
         return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
 
     @property
     def motor_law(self) -> str:
-        """``control.actuator``, or "own" of a class with a ``_compute_torques`` of its own."""
+        """``control.actuator``; "own" for a class that overrides ``_compute_torques``."""
         overridden = type(self)._compute_torques is not RobotTask._compute_torques
         return own_law(self.cfg, type(self).__name__) if overridden else self.cfg.control.actuator
 
@@ -149,7 +148,7 @@ class RobotTask(BaseTask):
         return self.actuators.gain("damping")
 
     def _update_state(self) -> None:
-        """All that termination and rewards read, computed once."""
+        """Compute once what termination and rewards read."""
         self._episode_length_buf.add_(1)
         self._refresh_base()
 
@@ -165,8 +164,11 @@ class RobotTask(BaseTask):
         self.base_ang_vel_world.copy_(quat_rotate(quat[:, 0], self.base_ang_vel))
 
     def _end_step(self) -> None:
-        """What the next step remembers; the reward has seen this step's values."""
-        self._remember_for_rewards()
+        """Keep values for the next step, after the reward has read this step's."""
+        if "last_last_actions" in vars(self):
+            self.last_last_actions.copy_(self.last_actions)
+        if self.last_dof_vel is not None:
+            self.last_dof_vel.copy_(self.dof_vel)
         self.last_actions.copy_(self.actions)
 
     # ---- termination ----------------------------------------------------------------------------------------------
@@ -180,11 +182,11 @@ class RobotTask(BaseTask):
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
 
     def _fallen(self) -> Tensor:
-        """(N,) The robot failed: too tilted, too low, or on the ground with what must not touch it."""
+        """(N,) The robot failed: too tilted, too low, or a part on the ground that must not touch it."""
         return reduce(torch.logical_or, self.fall_rules().values())
 
     def fall_rules(self) -> dict[str, Tensor]:
-        """(N,) each, by the field that it comes from."""
+        """The causes of a fall, (N,) each, by their config fields."""
         tilt, low = math.cos(math.radians(self.cfg.termination.max_tilt)), self.cfg.termination.min_base_height
         rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # at 180 degrees never
         if len(self.terminating_contacts):
@@ -204,11 +206,12 @@ class RobotTask(BaseTask):
 
     def reset_envs(self, mask: Tensor) -> None:
         """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
-        self._update_curricula(mask)
+        self._update_curricula(mask & (self.episode_steps[:, 0] > 0.0))
         self.sim.reset(mask)
         self.domain_rand.reset(mask)
         self._reset_robots(mask)
-        self._forget_for_rewards(mask)
+        if self.last_dof_vel is not None:
+            assign(self.last_dof_vel, mask, self.dof_vel)  # the first step compares with the start
         self._reset_task(mask)
         self.perturbation.reset(mask)
         self._episode.masked_fill_(mask[:, None], 0.0)
@@ -224,22 +227,22 @@ class RobotTask(BaseTask):
         self.observations.recall(before, ~mask)
 
     def first_observations(self) -> TensorDict:
-        """Observe as an episode begins, after a caller changed state or commands: no delay or history shows what was before."""
+        """Observe with empty delays and histories, after a caller changed state or commands."""
         self.observations.restart(torch.ones_like(self.reset_buf))
         self.compute_observations()
         return self.get_observations()
 
     def _update_curricula(self, mask: Tensor) -> None:
-        """Where ``mask`` (N,) is true an episode has ended: what becomes harder or easier."""
+        """Make the task harder or easier where ``mask`` (N,) is true: an episode of a step or more ended there."""
         if self.cfg.perturbation.curriculum:
             self.perturbation.update_level(mask, self._share_survived())
 
     def on_training_progress(self, share: float) -> None:
-        """Follow a training, of which ``share`` (0 to 1) is done: kicks, and what the terms change with it."""
+        """Follow a training, of which ``share`` (0 to 1) is done: kicks grow, and terms of a subclass may change."""
         self.perturbation.anneal(share)
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Root near its start with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
+        """Root near its start, any heading, small velocities; joints and servo targets at or near the default pose."""
         n = self.num_envs
         draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
         half = 0.5 * draw[:, 2:3]
@@ -253,7 +256,7 @@ class RobotTask(BaseTask):
         self.observations.restart(mask)
 
     def _start_angles(self) -> Tensor:
-        """Joint angles of a new episode (N, D) [rad]: the default pose, or drawn around it and within the joints' ranges."""
+        """Joint angles of a new episode (N, D) [rad]: the default pose, or drawn around it, within joint ranges."""
         joints, init = self.default_dof_pos.expand(self.num_envs, -1), self.cfg.init_state
         if init.dof_pos_range != [1.0, 1.0]:
             joints = joints * torch.empty_like(self.dof_offset).uniform_(*init.dof_pos_range)
@@ -263,19 +266,18 @@ class RobotTask(BaseTask):
         return joints
 
     def _start_places(self, offset: Tensor) -> Tensor:
-        """Where an episode begins, (N, 3) [m, world], ``offset`` (N, 2) [m] away from the middle."""
+        """The root's place in a new episode, (N, 3) [m, world], ``offset`` (N, 2) [m] away from the middle."""
         place = self.init_pos.expand(self.num_envs, 3)
         return torch.cat([place[:, :2] + offset, place[:, 2:]], dim=1)
 
     def _reset_task(self, mask: Tensor) -> None:
-        """What else of the task begins where ``mask`` (N,) is true. Here nothing."""
+        """For subclasses: begin what else the task has, where ``mask`` (N,) is true."""
 
     def _share_survived(self) -> Tensor:
-        """(N,) How much of its episode a robot survived, from 0 to 1; negative before its first step."""
-        share = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
-        return torch.where(self.episode_steps[:, 0] > 0.0, share, -1.0)
+        """(N,) Share of its episode that a robot survived, from 0 to 1."""
+        return torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
 
-    # ---- observations -------------------------------------------------------------------------------------------------
+    # ---- observations -----------------------------------------------------------------------------------------------
 
     def compute_observations(self) -> None:
         """Fill ``obs_buf`` as the table says."""
@@ -284,20 +286,18 @@ class RobotTask(BaseTask):
     def _prepare_observations(self) -> None:
         if hasattr(self, "_observation_rows"):
             raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
-        self.observations = self.remember(
-            Observations(
-                checked_rows(self.observation_rows, self.num_envs),
-                self.cfg.observations,
-                self.cfg.noise.level,
-                self.num_envs,
-                self.device,
-                lambda width: make_delay(self.cfg, "observation_delay", self.domain_rand.values, width),
-            )
-        )
+        rows, cfg = checked_rows(self.observation_rows, self.num_envs), self.cfg
+        late = self.domain_rand.values.get("observation_delay")
+        delay = None if late is None else partial(Delay, cfg, "observation_delay", late)
+        made = Observations(rows, cfg.observations, cfg.noise.level, self.num_envs, self.device, delay)
+        self.observations = self.remember(made)
         self.obs_buf = self.observations.buffers
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
-        """Rows of each group, in order; a name stands for a group above it. Asked once: values are buffers of the step."""
+        """Rows of each group, in order. A string includes an earlier group.
+
+        Called once: each value must be a buffer that the step writes in place.
+        """
         return {
             "state": [*self._measured_rows()],
             "privileged_state": ["state", *self._body_rows(), *self._disturbance_rows()],  # first the same noisy sample
@@ -306,51 +306,44 @@ class RobotTask(BaseTask):
     def _measured_rows(self) -> list[Row]:
         """What a robot measures or estimates of itself, with noise, and its last action."""
         noise = self.cfg.noise.scales
-        return [
-            # at the IMU, body frame [m/s]
-            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),
-            # gyro, body frame [rad/s]
-            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),
-            # direction, body frame
+        return [  # velocity, angular rate and gravity's direction in the body frame, at the IMU
+            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # [m/s]
+            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro [rad/s]
             Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
-            # minus the default pose [rad]
-            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),
+            Row(
+                "dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True
+            ),  # minus default pose [rad]
             Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
             Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
         ]
 
     def _body_rows(self) -> list[Row]:
-        """The same without noise, and more, as only a simulator knows it."""
+        """The same without noise, and more that only a simulator knows."""
         return [
             Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
             Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
             Row("projected_gravity", self.projected_gravity, mirror="polar"),
             Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
-            # [rad/s]; the world mirrors about its own x-z plane
-            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),
+            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # [rad/s]; mirrored in the world's x-z
             Row("dof_pos", self.dof_offset, mirror="joint"),
             Row("dof_vel", self.dof_vel, mirror="joint"),
             Row("torques", self.torques, mirror="joint"),  # [N m]
         ]
 
     def _disturbance_rows(self) -> list[Row]:
-        """Kicks, and with ``domain_rand.observe`` what was drawn, in the config's units."""
-        rand = self.domain_rand
-        drawn = [
-            Row(name, value, mirror=rand.mirrors[name])
-            for name, value in rand.values.items()
-            if self.cfg.domain_rand.observe
-        ]
+        """Kicks, and with ``domain_rand.observe`` the drawn numbers, in the config's units."""
+        rand, kick = self.domain_rand, self.perturbation
+        drawn = rand.values.items() if self.cfg.domain_rand.observe else ()
         return [
-            Row("kick_force", self.perturbation.kick_force, mirror="polar"),  # on the root, world frame [N]
-            Row("kick_active", self.perturbation.kick_active[:, None], mirror="scalar"),  # 0 or 1
-            *drawn,
+            Row("kick_force", kick.kick_force, mirror="polar"),  # on the root, world frame [N]
+            Row("kick_active", kick.kick_active[:, None], mirror="scalar"),  # 0 or 1
+            *(Row(name, value, mirror=rand.mirrors[name]) for name, value in drawn),
         ]
 
     @cached_property
     def mirror(self) -> Mirror:
-        """Observations and actions left for right, from the table; made when first asked for, and not for the step."""
-        return make_mirror(self.observations.groups, self._mirror_blocks(), self._mirror_reach(), self.device)
+        """The mirror image of observations and actions, from the table. The step does not use it."""
+        return make_mirror(self.observations.groups, self._mirror_blocks(), self.mirror_reach, self.device)
 
     def _mirror_blocks(self) -> dict[str, Block]:
         """Kinds of mirror image that rows may have, by name."""
@@ -361,11 +354,7 @@ class RobotTask(BaseTask):
     def _partners(self) -> Partners:
         return find_partners(self.robot)
 
-    def _mirror_reach(self) -> float:
-        """[m] from the mirrored IMU to the IMU."""
-        return 2.0 * float(self.imu_pos[0, 1])
-
-    # ---- reward -------------------------------------------------------------------------------------------------------
+    # ---- reward -----------------------------------------------------------------------------------------------------
 
     def compute_reward(self) -> None:
         """Sum of scale * term * dt, clipped; ``termination`` is added after the clip. Broken worlds get 0."""
@@ -388,29 +377,26 @@ class RobotTask(BaseTask):
     def _prepare_reward_function(self) -> None:
         """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
         scales = self._active_scales()
-        terms = {
-            name.removeprefix("_reward_"): getattr(self, name) for name in dir(self) if name.startswith("_reward_")
-        }
+        methods = [name for name in dir(self) if name.startswith("_reward_")]
+        terms = {name.removeprefix("_reward_"): getattr(self, name) for name in methods}
         after_clip = [] if self.cfg.rewards.clip_termination else ["termination"]
         self.reward_names = [n for n in scales if n not in after_clip] + [n for n in after_clip if n in scales]
         self._num_clipped = len([n for n in scales if n not in after_clip])
         for name in self.reward_names:
-            where = f"{type(self).__name__} (a method _reward_<name>)"
             if name not in terms:
-                raise ConfigError(
-                    f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}"
-                )
+                where = f"{type(self).__name__} (a method _reward_<name>)"
+                what = unknown("reward term", name, terms, where)
+                raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {what}")
             check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
-        self.nonfinite = [
-            self.remember(NonFinite([f"reward term '{n}'" for n in self.reward_names], self.device)),
-            *self.observations.nonfinite(),
-        ]
-        self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
+        bad_terms = self.remember(NonFinite([f"reward term '{name}'" for name in self.reward_names], self.device))
+        self.nonfinite = [bad_terms, *self.observations.nonfinite()]
+        # (K,) ``rewards.scales`` times dt, as in legged_gym: a step's reward is this times the term
+        self.reward_scales = self._tensor([scales[name] for name in self.reward_names]) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = self.remember(Statistics(means, ["episodes", "fell", "broken"], self.device))
 
-    # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
+    # ---- statistics: summed on the device, read once an iteration ---------------------------------------------------
 
     def _sum_statistics(self) -> None:
         """Add the episodes that end in this step. Runs before the reset."""
@@ -418,19 +404,19 @@ class RobotTask(BaseTask):
         self.statistics.add(self.reset_buf, means, torch.stack([self.reset_buf, self.fell, self.broken], dim=1))
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Values as they stand: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
+        """Present values: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
         worlds = {"overflowed": self.sim.overflowed_worlds(), **self.broken_worlds.statistics()}  # so far
         return worlds | self.perturbation.statistics()
 
     def take_statistics(self) -> Tensor:
-        """Sums since the last call and values as they stand (S,), on the device."""
+        """Sums since the last call, and present values (S,), on the device."""
         return self.statistics.take(self._live_statistics())
 
     def name_statistics(self, taken: list[float]) -> dict[str, float]:
-        """Statistics by name, from what ``take_statistics`` returned. Means are NaN if no episode ended.
+        """Statistics by name, from the vector of ``take_statistics``. Means are NaN if no episode ended.
 
-        ``rew_<name>``: mean over episodes of the sum of scale * term * dt, before the clip, divided by ``env.episode_length_s``.
-        ``reward``: the episode's return. ``episode_length`` [control steps].
+        ``rew_<name>``: mean over episodes of the sum of scale * term * dt, before the clip, divided by
+        ``env.episode_length_s``. ``reward``: the episode's return. ``episode_length`` [control steps].
         """
         seconds = self.cfg.env.episode_length_s
         named = self.statistics.name(taken)
@@ -440,18 +426,18 @@ class RobotTask(BaseTask):
         """Statistics since the last call, by name. Reads the device."""
         return self.name_statistics(self.take_statistics().tolist())
 
-    # ---- what training learned about its worlds, for a checkpoint --------------------------------------------------------------
+    # ---- curricula in a checkpoint ----------------------------------------------------------------------------------
 
     def training_state(self) -> dict[str, Tensor]:
-        """Curricula as they stand: tensors, by name."""
+        """The state of the curricula: tensors, by name."""
         return {"kick_level": self.perturbation.kick_level.clone()} if self.cfg.perturbation.curriculum else {}
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from ``training_state``, of several processes from the first one's. Worlds take what the nearest ones had."""
+        """Continue from ``training_state`` (of rank 0). If the number of worlds differs, each takes its nearest's."""
         if "kick_level" in state and self.cfg.perturbation.curriculum:
             self.perturbation.kick_level.copy_(spread(state["kick_level"], self.num_envs))
 
-    # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
+    # ---- robot and buffers: made here, never rebound ----------------------------------------------------------------
 
     def _make_terrain(self) -> Terrain | None:
         """The ground; None: a plane."""
@@ -466,7 +452,7 @@ class RobotTask(BaseTask):
         return [*self.cfg.asset.penalize_contacts_on, *self.cfg.asset.terminate_after_contacts_on]
 
     def _sensed_sites(self) -> dict[str, list[str]]:
-        """Sites whose velocity is sensed -> geoms: where the MJCF lacks one, it is made at the lowest point of them."""
+        """Sites with a velocity sensor -> geoms: a site that the MJCF lacks is made at their lowest point."""
         return {}
 
     def _init_buffers(self) -> None:
@@ -479,19 +465,16 @@ class RobotTask(BaseTask):
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self.buffer(3) for _ in range(3))
         self.dof_offset = self.buffer(self.num_actions)  # joint position minus default [rad]
-        law, drawn = self.motor_law, self.domain_rand.values
-        self.actuators = self.remember(
-            Actuators(self.cfg, law, self.robot, sim, drawn, self.default_dof_pos, self._compute_torques)
-        )
-        exact = self.actuators.encoder_offset is None
-        self.joint_reading = self.dof_offset if exact else self.buffer(self.num_actions)  # the same, as measured
+        law, drawn, default = self.motor_law, self.domain_rand.values, self.default_dof_pos
+        actuators = Actuators(self.cfg, law, self.robot, sim, drawn, default, self._compute_torques)
+        self.actuators = self.remember(actuators)
+        exact = actuators.encoder_offset is None
+        self.joint_reading = self.dof_offset if exact else self.buffer(self.num_actions)  # dof_offset by the encoders
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self.buffer(dtype=torch.bool), self.buffer(dtype=torch.bool)
-        self.broken_worlds = self.remember(
-            BrokenWorlds(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
-        )
-        # one matrix, so that a reset clears it in one go
-        self._episode, views = columns(n, device, **self._episode_columns())
+        broken_worlds = BrokenWorlds(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
+        self.broken_worlds = self.remember(broken_worlds)
+        self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, cleared in one operation
         self.remember(self._episode)
         for name, view in views.items():
             setattr(self, name, view)
@@ -499,29 +482,27 @@ class RobotTask(BaseTask):
         self.gravity_dir = self.domain_rand.gravity_dir  # (N, 3) world frame
         self.total_mass = float(model.body_subtreemass[0])  # [kg]
         self.root_body = self.robot.id("body", self.robot.root)
-        # body frame [m]
-        self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)
+        imu = self.robot.id("site", self.robot.imu)
+        self.imu_pos = self._tensor(model.site_pos[imu]).expand(n, 3)  # body frame [m]
+        self.mirror_reach = 2.0 * float(self.imu_pos[0, 1])  # [m] from the mirrored IMU to the IMU
         self._init_contacts()
         self._init_robot_rewards()
 
     def _init_contacts(self) -> None:
-        """What ``asset.terminate_after_contacts_on`` and ``asset.penalize_contacts_on`` mean: C sensed geoms, B penalised bodies."""
+        """Columns of contact_count that ``asset.terminate_after_contacts_on`` and ``penalize_contacts_on`` mean."""
         asset, robot = self.cfg.asset, self.robot
-        # columns of contact_count that are a fall
         fall = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
         self.terminating_contacts = torch.tensor(fall, dtype=torch.long, device=self.device)
         columns = self._contact_columns(asset.penalize_contacts_on, "penalize_contacts_on")
-        if "collision" in self._active_scales() and not columns:
-            raise ConfigError(
-                "rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch"
-            )
-        geoms = {column: robot.id("geom", robot.contact_geoms[column]) for column in columns}
-        body = {column: int(robot.physics.geom_bodyid[geom]) for column, geom in geoms.items()}
-        bodies = sorted(set(body.values()))
+        if "collision" in self._active_scales():
+            require(bool(columns), "collision", "asset.penalize_contacts_on names nothing; name what should not touch")
+        geoms = [robot.id("geom", robot.contact_geoms[column]) for column in columns]
+        body_of = [int(robot.physics.geom_bodyid[geom]) for geom in geoms]
+        bodies = sorted(set(body_of))
         table = torch.zeros(self.contact_count.shape[1], len(bodies))
-        for column in columns:
-            table[column, bodies.index(body[column])] = 1.0
-        self.penalized_contacts = table.to(self.device)  # (C, B) 1 where a geom is of a body
+        for column, body in zip(columns, body_of, strict=True):
+            table[column, bodies.index(body)] = 1.0
+        self.penalized_contacts = table.to(self.device)  # (C, bodies) 1 where a sensed geom is of a penalised body
 
     def _contact_columns(self, patterns: list[str], field: str) -> list[int]:
         """Columns of contact_count. Raises ConfigError for a geom that never touches the ground."""
@@ -529,27 +510,30 @@ class RobotTask(BaseTask):
         meant = robot.names.find(patterns, f"asset.{field}")
         for name in meant:
             if not robot.physics.geom_conaffinity[robot.id("geom", name)]:
-                raise ConfigError(
-                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {asset.colliders}"
-                )
+                what = f"'{name}' never touches the ground; add it to asset.colliders: {asset.colliders}"
+                raise ConfigError(f"asset.{field}: {what}")
         return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
 
     def _episode_columns(self) -> dict[str, int]:
-        """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
-        sums = {"episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
-        return {"last_actions": self.num_actions, **sums, **self._columns_for_rewards()}
+        """Name -> width of the attributes (N, width) that a reset clears."""
+        on, joints = self._active_scales(), self.num_actions
+        sums = {"episode_sums": len(on), "episode_return": 1, "episode_steps": 1}
+        before = {"last_last_actions": joints} if "action_smoothness" in on else {}
+        return {"last_actions": joints, **sums, **before}
 
     last_actions: Tensor  # (N, D)
     last_last_actions: Tensor  # (N, D) a_(t-2); only with `action_smoothness`
+    last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]; only with `dof_acc`
     episode_sums: Tensor  # (N, K) scale * term * dt summed over the episode
     episode_return: Tensor  # (N, 1)
     episode_steps: Tensor  # (N, 1) since the reset; episode_length_buf may start elsewhere
 
     def _init_ranges(self) -> None:
-        """Config numbers as tensors: joints' tables and ranges of a reset."""
+        """Numbers of the config as tensors: joints' tables and ranges of a reset."""
         cfg, init = self.cfg, self.cfg.init_state
         self.default_dof_pos = self._tensor(self.robot.pose)
-        self.pose_weights = self._tensor(self.robot.tables["rewards.pose_weights"])
+        self.pose_weights = self._tensor(self.robot.tables["rewards.pose_weights"])  # (D,)
+        self.deviation_weights = self._tensor(self.robot.tables["rewards.deviation_weights"])  # (D,)
         self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
         # `soft_dof_pos_limit` of each joint's range, about its middle; infinite where it has no limits
         middle = (self.joint_lower + self.joint_upper) / 2
@@ -558,39 +542,37 @@ class RobotTask(BaseTask):
         self.soft_upper = torch.where(half.isfinite(), middle + half, self.joint_upper)
         self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]
         self.init_pos = self._tensor(self.start_place)
-        self.reset_range = self._tensor(
-            [init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3
-        )
+        spans = [init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3
+        self.reset_range = self._tensor(spans)  # (9,)
 
     def _tensor(self, values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.float, device=self.device)
 
-    # ---- what reward terms need beside the state, where they are on ---------------------------------------------------
+    # ---- reward terms, and what the active ones need besides the state ----------------------------------------------
 
     def _active_scales(self) -> dict[str, float]:
-        """Terms that are on, and their scales."""
+        """Terms that are on -> ``rewards.scales``, without dt."""
         return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
 
     def _sensed_on_demand(self) -> list[str]:
-        """Sensors that terms that are on need, and those that ``asset.sense`` names: of ``SENSORS``, or of the robot's file."""
+        """Values that active terms or ``asset.sense`` need: of ``SENSORS``, or sensors of the robot's file."""
         needed = [sensor for term, sensor in self.SENSED_FOR.items() if term in self._active_scales()]
         return [*needed, *self.cfg.asset.sense]
 
     def sensor(self, name: str) -> Tensor:
-        """(N, size) What a sensor of ``SENSORS`` or of the robot's file measured in the last substep: a view, whose place is fixed."""
+        """(N, size) A view of the sensor ``name``, of ``SENSORS`` or of the robot's file, in the last substep."""
         if name in SENSORS:
             if name not in self.robot.sensors:
                 raise not_sensed(name)
             return self.sim.sensordata[:, self.robot.sensors[name]]
         if name in self.robot.file_sensors and not self.robot.spec.sensor(name):
-            raise ConfigError(
-                f"sensor '{name}' of the robot's file was dropped; write asset.sense = ['{name}'] in the config"
-            )
+            what = f"sensor '{name}' of the robot's file was dropped"
+            raise ConfigError(f"{what}; write asset.sense = ['{name}'] in the config")
         return self.sim.sensordata[:, self.robot.columns(name)]
 
     @property
     def self_contacts(self) -> Tensor:
-        """(N, 1) How many contacts the robot has with itself."""
+        """(N, 1) Number of contacts of the robot with itself."""
         return self.sensor(SELF_CONTACT)
 
     @property
@@ -599,54 +581,36 @@ class RobotTask(BaseTask):
         return self.sensor(ANGULAR_MOMENTUM)
 
     def _init_robot_rewards(self) -> None:
-        """What terms need beside the state, where they are on."""
+        """Allocate what the active terms need besides the state."""
         on, rewards, robot = self._active_scales(), self.cfg.rewards, self.robot
         known = [*SENSORS, *robot.file_sensors]
         for name in self.cfg.asset.sense:
             if name not in known:
-                raise ConfigError(
-                    f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}"
-                )
-        self.last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]
+                where = f"{type(self).__name__} and its file"
+                raise ConfigError(f"asset.sense: {unknown('value or sensor', name, known, where)}")
         if "dof_acc" in on:
             self.last_dof_vel = self.buffer(self.num_actions)
         if "hip_pos" in on:
             self.hips = self._joints_called(rewards.hip_joints, "hip_joints")  # indices
         if "joint_mirror" in on:
             pairs = [[self._joints_called([word], "mirror_joints") for word in pair] for pair in rewards.mirror_joints]
-            for words, pair in zip(rewards.mirror_joints, pairs, strict=True):
-                if [len(joints) for joints in pair] != [len(pair[0])] * 2:
-                    raise ConfigError(
-                        f"rewards.mirror_joints: {words} must be two names or patterns that mean as many joints"
-                    )
+            for words, (first, second) in zip(rewards.mirror_joints, pairs, strict=True):
+                if len(first) != len(second):
+                    what = f"{words} must be two names or patterns that mean as many joints"
+                    raise ConfigError(f"rewards.mirror_joints: {what}")
             # (2, pairs) indices of joints
             self.mirror_pairs = torch.cat([torch.stack(pair) for pair in pairs], dim=1) if pairs else torch.empty(0)
-        if "joint_deviation" in on:
-            self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])  # (D,)
         if "torque_limits" in on:
-            require(
-                bool(np.isfinite(robot.effort_range).any()),
-                "torque_limits",
-                "no joint has a force limit; write asset.effort",
-            )
-            # (2, D) lowest and highest torque [N m]
-            self.soft_effort = self._row(robot.effort_range.T * rewards.soft_torque_limit)
+            limited = bool(np.isfinite(robot.effort_range).any())
+            require(limited, "torque_limits", "no joint has a force limit; write asset.effort")
+            self.soft_effort = self._tensor(robot.effort_range.T * rewards.soft_torque_limit)  # (2, D) low, high [N m]
         if "dof_vel_limits" in on:
-            needed = "no joint has a highest speed; write asset.joint_speed_limits"
-            require(bool(np.isfinite(robot.speed_limits).any()), "dof_vel_limits", needed)
-            self.soft_speed = self._row(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
-
-    def _row(self, values: object) -> Tensor:
-        return torch.as_tensor(values, dtype=torch.float, device=self.device)
-
-    def _columns_for_rewards(self) -> dict[str, int]:
-        """What an episode remembers for terms that are on: name -> width."""
-        return (
-            {"last_last_actions": len(self.robot.joint_names)} if "action_smoothness" in self._active_scales() else {}
-        )
+            limited = bool(np.isfinite(robot.speed_limits).any())
+            require(limited, "dof_vel_limits", "no joint has a highest speed; write asset.joint_speed_limits")
+            self.soft_speed = self._tensor(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
 
     def _joints_called(self, wanted: list[str], field: str) -> Tensor:
-        """Indices of the joints whose name fits one of ``wanted``, patterns or parts of names. Held joints are left out."""
+        """Indices of the joints that ``wanted`` (patterns or parts of names) means. Held joints are left out."""
         names, held = self.robot.joint_names, self.robot.held
         fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
         for word, found in fits.items():
@@ -657,26 +621,12 @@ class RobotTask(BaseTask):
         indices = [i for i, name in enumerate(names) if any(name in found for found in fits.values())]
         return torch.tensor(indices, dtype=torch.long, device=self.device)
 
-    def _remember_for_rewards(self) -> None:
-        """The end of a step: what the next one compares with. ``last_actions`` are still those of the step before."""
-        if "last_last_actions" in vars(self):
-            self.last_last_actions.copy_(self.last_actions)
-        if self.last_dof_vel is not None:
-            self.last_dof_vel.copy_(self.dof_vel)
-
-    def _forget_for_rewards(self, mask: Tensor) -> None:
-        """A new episode begins where ``mask`` (N,) is true: its first step compares with its start."""
-        if self.last_dof_vel is not None:
-            assign(self.last_dof_vel, mask, self.dof_vel)
-
-    # ---- the base
-
     def _reward_alive(self) -> Tensor:
         """1 in every step. [U 0.15, P]"""
         return torch.ones_like(self.rew_buf)
 
     def _reward_lin_vel_z(self) -> Tensor:
-        """Square of the vertical velocity at the IMU, world frame [m^2/s^2] (gravity points down: the same square). [P]"""
+        """Squared vertical velocity at the IMU, world frame [m^2/s^2] (gravity points down: the same square). [P]"""
         return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
 
     def _reward_ang_vel_xy(self) -> Tensor:
@@ -688,13 +638,9 @@ class RobotTask(BaseTask):
         return self.projected_gravity[:, :2].square().sum(dim=1)
 
     def _reward_base_height(self) -> Tensor:
-        """Squared distance of the root's height above the ground under it from ``rewards.base_height_target`` [m^2]. [L; U -10]"""
+        """Squared error of the root's height above the ground from ``rewards.base_height_target`` [m^2]. [L; U -10]"""
         target = self.cfg.rewards.base_height_target
-        require(
-            target > 0.0,
-            "base_height",
-            "rewards.base_height_target is 0; write the wanted height of the root above the ground [m]",
-        )
+        require(target > 0.0, "base_height", "rewards.base_height_target is 0; write the wanted height of the root [m]")
         return (self.base_height - target).square()
 
     def _reward_angular_momentum(self) -> Tensor:
@@ -705,10 +651,8 @@ class RobotTask(BaseTask):
         """A fall. [L, P]"""
         return self.fell.float()
 
-    # ---- the joints
-
     def _reward_dof_pos_limits(self) -> Tensor:
-        """What joints exceed the soft limits by [rad]. [L]"""
+        """Angles beyond the joints' soft limits [rad]. [L]"""
         return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
 
     def _reward_pose(self) -> Tensor:
@@ -716,54 +660,47 @@ class RobotTask(BaseTask):
         return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))
 
     def _reward_hip_pos(self) -> Tensor:
-        """Squared distance of the joints that ``rewards.hip_joints`` means from the default pose [rad^2]. [U -1]"""
-        require(
-            bool(self.cfg.rewards.hip_joints),
-            "hip_pos",
-            "rewards.hip_joints is empty; write names of joints, parts of them or patterns",
-        )
+        """Squared distance of the joints ``rewards.hip_joints`` from the default pose [rad^2]. [U -1]"""
+        needed = "rewards.hip_joints is empty; write names of joints, parts of them or patterns"
+        require(bool(self.cfg.rewards.hip_joints), "hip_pos", needed)
         return self.dof_offset.index_select(1, self.hips).square().sum(dim=1)
 
     def _reward_joint_deviation(self) -> Tensor:
-        """Distance of the joints from the default pose [rad], each times its ``rewards.deviation_weights``. [I; its G1 -0.1 for hips]"""
+        """Distance of joints from the default pose [rad], times ``rewards.deviation_weights``. [I; G1's hips -0.1]"""
         return (self.dof_offset.abs() * self.deviation_weights).sum(dim=1)
 
     def _reward_joint_mirror(self) -> Tensor:
-        """Squared difference of the angles of two legs' joints, mean over the pairs of ``rewards.mirror_joints`` [rad^2]. [UL]"""
+        """Squared difference of two legs' joint angles, mean over the pairs ``rewards.mirror_joints`` [rad^2]. [UL]"""
         pairs = self.cfg.rewards.mirror_joints
-        require(
-            bool(pairs),
-            "joint_mirror",
-            "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]",
-        )
+        needed = "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]"
+        require(bool(pairs), "joint_mirror", needed)
         first, second = self.mirror_pairs
-        return (self.dof_pos.index_select(1, first) - self.dof_pos.index_select(1, second)).square().sum(dim=1) / len(
-            pairs
-        )
+        apart = self.dof_pos.index_select(1, first) - self.dof_pos.index_select(1, second)
+        return apart.square().sum(dim=1) / len(pairs)
 
     def _reward_dof_vel(self) -> Tensor:
         """Squared joint velocities [rad^2/s^2]. [L; U -1e-3]"""
         return self.dof_vel.square().sum(dim=1)
 
     def _reward_dof_acc(self) -> Tensor:
-        """Squared joint accelerations: what the velocity changed by in a control step [rad^2/s^4]. [L, U -2.5e-7]"""
+        """Squared joint accelerations, from the change of velocity in a control step [rad^2/s^4]. [L, U -2.5e-7]"""
         assert self.last_dof_vel is not None
         return ((self.dof_vel - self.last_dof_vel) / self.dt).square().sum(dim=1)
 
     def _reward_dof_vel_limits(self) -> Tensor:
-        """What joints exceed ``rewards.soft_dof_vel_limit`` of their highest speed by, at most 1 each [rad/s]. [L]"""
+        """Joint speeds beyond ``rewards.soft_dof_vel_limit`` of the highest, at most 1 each [rad/s]. [L]"""
         return (self.dof_vel.abs() - self.soft_speed).clamp(0.0, 1.0).sum(dim=1)
 
     def _reward_fast_joints(self) -> Tensor:
-        """What joints are faster than a turn a second, squared [rad^2/s^2]. [P]"""
+        """Squared joint speeds beyond a turn a second [rad^2/s^2]. [P]"""
         return (self.dof_vel.abs() - 2.0 * torch.pi).clamp(min=0.0).square().sum(dim=1)
 
     def _reward_torque_limits(self) -> Tensor:
-        """What torques exceed ``rewards.soft_torque_limit`` of the servo's limit by [N m]. [L]"""
+        """Torques beyond ``rewards.soft_torque_limit`` of the servo's force limit [N m]. [L]"""
         return (self.torques - self.torques.clamp(*self.soft_effort)).abs().sum(dim=1)
 
     def _reward_torques(self) -> Tensor:
-        """2-norm plus 1-norm of the joint torques [N m] [P]; or the sum of their squares: ``rewards.torques_as`` [L]."""
+        """2-norm plus 1-norm of the joint torques [N m] [P]; or their squares' sum: ``rewards.torques_as`` [L]."""
         if self.cfg.rewards.torques_as == "squares":
             return self.torques.square().sum(dim=1)
         return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
@@ -780,19 +717,14 @@ class RobotTask(BaseTask):
         """Sum of |joint velocity * torque| [W]. [P]"""
         return (self.dof_vel * self.torques).abs().sum(dim=1)
 
-    # ---- contacts
-
     def _reward_collision(self) -> Tensor:
-        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
+        """Number of bodies of ``asset.penalize_contacts_on`` on the ground. [L]"""
         return ((self.contact_count @ self.penalized_contacts) > 0.0).sum(dim=1).float()
 
     def _reward_self_collision(self) -> Tensor:
-        """How many contacts the robot has with itself. [M; its G1 -1]"""
-        require(
-            self.cfg.asset.self_collisions,
-            "self_collision",
-            "asset.self_collisions is False, so that parts pass through one another",
-        )
+        """Number of contacts of the robot with itself. [M; its G1 -1]"""
+        needed = "asset.self_collisions is False, so that parts pass through one another"
+        require(self.cfg.asset.self_collisions, "self_collision", needed)
         return self.self_contacts[:, 0].clone()
 
 
@@ -805,20 +737,16 @@ def load_robot(
     sites: Mapping[str, Sequence[str]] = {},
     more_sensors: Collection[str] = (),
 ) -> RobotModel:
-    """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
-    asset, scale = cfg.asset, cfg.control.action_scale
-    stiffness, damping = motor_gains(cfg, law)
+    """The robot of ``asset.file`` with the config's joints, contacts and sensors, and motors of ``law``."""
+    asset, on, scale = cfg.asset, cfg.terrain, cfg.control.action_scale
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     try:
         return build_model(
             find_file(cfg, "asset.file"),
             solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
-            ground=Ground(
-                cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope
-            ),
-            stiffness=stiffness,
-            damping=damping,
+            ground=Ground(on.friction, on.condim, terrain, boxes=engine == "mujoco", slope=on.slope),
+            **motor_gains(cfg, law),
             colliders=asset.colliders,
             self_collisions=asset.self_collisions,
             contact_geoms=contact_geoms,
@@ -842,9 +770,10 @@ def load_robot(
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
-    """x, y, z of the root [m]: the config's; or with its feet as high above the ground as in the keyframe; or with the lowest foot on it.
+    """x, y, z of the root at reset [m].
 
-    Without feet it is the lowest of the ``colliders``.
+    It is the config's ``init_state.pos``; else the feet are as high as in the keyframe; else the lowest foot is on the
+    ground. Without feet it is the lowest of the ``colliders``.
     """
     if cfg.init_state.pos:
         return list(cfg.init_state.pos)
@@ -858,22 +787,21 @@ def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) 
 
 
 def check_term(method: Callable[[], Any], count: int) -> Tensor:
-    """What a reward method returns, if it is a number an environment. Raises StepError with the method's place."""
+    """The value of a reward method. Raises StepError, with the method's place, unless it is (``count``,)."""
     value = method()
     if not isinstance(value, Tensor) or value.shape != (count,):
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise StepError(
-            f"must return a tensor ({count},), one value an environment; it returned {got}", place_of(method)
-        )
+        wanted = f"must return a tensor ({count},), one value an environment"
+        raise StepError(f"{wanted}; it returned {got}", place_of(method))
     return value
 
 
 def require(given: bool, term: str, what: str) -> None:
-    """Refuse a term that is on without what it needs; terms are tried once before training."""
+    """Refuse an active term that lacks something. A term may call this: each is tried once before training."""
     if not given:
         raise ConfigError(f"rewards.scales.{term} is on, but {what}")
 
 
 def not_sensed(name: str) -> ConfigError:
-    """What reads ``name``, which nothing asked for."""
+    """The error of reading ``name``, which neither a term nor ``asset.sense`` needs."""
     return ConfigError(f"{name} is not sensed; write asset.sense = ['{name}'] in the config")

@@ -1,7 +1,7 @@
-"""Every field of RobotTask, once, typed, with unit and source. Tasks override these in configs/.
+"""Every field of RobotTask, typed, with unit and source. Tasks override these in configs/.
 
 Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
-A field that turns one of our departures back into Playground's behaviour says so.
+"A table a joint" is key -> number: a joint takes its exact name's, else that of the longest key in its name, else "".
 """
 
 from __future__ import annotations
@@ -43,12 +43,10 @@ from legged_mw.utils.bounds import (
 from legged_mw.utils.config import Config, ConfigError
 
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
-Camera = Annotated[
-    list[float], or_empty(Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2])))
-]
-Pairs = Annotated[
-    list[list[str]], Bound("pairs: lists of two names or patterns each", lambda v: all(len(pair) == 2 for pair in v))
-]
+_CAMERA = Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2]))
+Camera = Annotated[list[float], or_empty(_CAMERA)]
+_PAIRS = Bound("pairs: lists of two names or patterns each", lambda v: all(len(pair) == 2 for pair in v))
+Pairs = Annotated[list[list[str]], _PAIRS]
 Kicks = Annotated[list[Annotated[float, at_least(-1000, 1000, "m/s")]], PAIR]
 Tilt = Annotated[float, above(0, 180, "degrees")]
 Slope = Annotated[float, at_least(-60, 60, "degrees")]
@@ -58,39 +56,34 @@ Pixels = Annotated[int, at_least(1, 8192)]
 
 
 class RobotTaskCfg(Config):
-    """The environment of any robot in any task. A joint's own value stands in a table: key -> number. The exact name wins, then the
-    longest key that is part of the name, then the key "".
-    """
+    """The environment of any robot in any task."""
 
     class env:
         num_envs: Count = 4096  # worlds stepped together
         episode_length_s: Seconds = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
-        file: str = ""
-        # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
-        imu_site: str = ""
-        # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
+        file: str = ""  # MJCF or URDF, plain or a vendor's; beside the config that names it, or in the repository
+        imu_site: str = ""  # site or body fixed to the root; empty: "imu" if it is so, else the root's origin [ours]
+        # geoms by name or pattern, or bodies by name (their colliding geoms), that touch the ground
         colliders: Names = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
-        penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
-        terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
-        # what code of yours reads: contact_forces, self_contacts, angular_momentum, sensors of the file by name
+        penalize_contacts_on: list[str] = []  # colliders likewise: `collision` counts their bodies on the ground [L]
+        terminate_after_contacts_on: list[str] = []  # colliders likewise: one of them on the ground is a fall [L]
+        # values to sense for your code, read by `env.sensor(name)`: contact_forces, self_contacts, angular_momentum, or
+        # a sensor of the file by name; active reward terms add theirs
         sense: list[str] = []
-        # names or patterns: welded at their default angle, so that they are no joints any more
-        held_joints: list[str] = []
+        held_joints: list[str] = []  # names or patterns of joints that are welded at their default angle
         # tables a joint that need not name every joint; the others keep the file's
         effort: dict[str, Positive] = {}  # highest force of the servo, both ways [N m]
         armature: dict[str, Gain] = {}  # inertia of the rotor at the joint [kg m^2]
         frictionloss: dict[str, Gain] = {}  # dry friction [N m]
-        # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
-        joint_speed_limits: dict[str, Positive] = {}
+        joint_speed_limits: dict[str, Positive] = {}  # the motor's highest speed, for report and rewards only [rad/s]
 
     class init_state:
-        # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
+        # root at reset [m]; empty: feet as high as in the keyframe "home" (or the only one), or on the ground
         pos: Place = []
-        # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
+        # table a joint: the pose of action 0 [rad]; joints without a key: that keyframe's
         default_joint_angles: dict[str, Angle] = {}
         dof_pos_range: Range = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: Range = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
@@ -101,42 +94,35 @@ class RobotTaskCfg(Config):
         ang_vel_range: Speed = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
 
     class control:
-        # servo: kp (target - angle), damped in the joint; dc_motor: kp (target - angle) - kd speed within a torque-speed curve;
-        # torque: the action is one, scaled; network: a file's weights make the torque (docs/motors.md)
+        # servo: kp (target - angle), damped in the joint; dc_motor: kp (target - angle) - kd speed, in a torque-speed
+        # curve; torque: scale * action; network: torque from the weights in a file (docs/motors.md)
         actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
         stiffness: dict[str, Gain] = {}  # table a joint: position gain [N m/rad]
-        # table a joint: passive damping; of a dc_motor its velocity gain, in its curve [N m s/rad]
-        damping: dict[str, Gain] = {}
-        # tables a joint of a torque-speed curve, which dc_motor needs and torque and network may have: at angular velocity w a motor
-        # gives from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), and at most asset.effort
+        damping: dict[str, Gain] = {}  # table a joint: passive damping; of a dc_motor its velocity gain [N m s/rad]
+        # tables a joint of a torque-speed curve: dc_motor needs it, torque and network may have it. At speed w torque
+        # is from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), within asset.effort
         stall_torque: dict[str, Positive] = {}  # [N m]
         no_load_speed: dict[str, Positive] = {}  # [rad/s]
-        # turns of the motor a turn of the joint; 1: the two tables are the joint's own
-        gear: dict[str, Positive] = {"": 1.0}
+        gear: dict[str, Positive] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the curve is at the joint
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
-        # written by train.py: that name -> SHA-256 of the file; a changed file is refused
-        network_digest: dict[str, str] = {}
-        # target = origin + scale * action [rad, rad/s]; a number, or a table a joint [P]
-        action_scale: Scale | dict[str, Scale] = 0.5
-        # the default pose, the measured angles or the last targets [P]; "speed": none, a dc_motor gives damping (scale action - speed)
+        network_digest: dict[str, str] = {}  # train.py writes name -> SHA-256 of the file; a changed file is refused
+        action_scale: Scale | dict[str, Scale] = 0.5  # target = origin + scale * action [rad, rad/s]; or a table [P]
+        # the default pose, the measured angles or the last targets [P]; "speed", of a dc_motor: targets are speeds
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
         decimation: SmallInt = 5  # simulation steps a control step [P]
 
     class observations:
-        # group -> rows of the table that it does without: {"state": ["base_lin_vel"]}
-        leave_out: dict[str, list[str]] = {}
+        leave_out: dict[str, list[str]] = {}  # group -> rows of the table to drop: {"state": ["base_lin_vel"]}
         history: dict[str, Count] = {}  # group, or "group.row" -> frames of each row, oldest first: {"state": 5}
 
     class termination:
-        max_tilt: Tilt = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
-        min_base_height: Height = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
-        # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
-        max_speed: Positive = 1.0e4
+        max_tilt: Tilt = 90.0  # [deg] between the root's z axis and the vertical; more is a fall [P]
+        min_base_height: Height = 0.0  # [m] of the root above the ground under it; less is a fall; 0: no limit [ours]
+        max_speed: Positive = 1.0e4  # [m/s, rad/s] of any degree of freedom; more counts as not finite [ours]
 
     class rewards:
         only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
-        # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
-        clip_termination: bool = False
+        clip_termination: bool = False  # True: clip `termination` too: a fall costs nothing [P]; False [L]
         max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
         # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
         soft_dof_pos_limit: PositiveShare = 0.95
@@ -145,20 +131,17 @@ class RobotTaskCfg(Config):
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
         mirror_joints: Pairs = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
         deviation_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
-        # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
-        soft_torque_limit: Positive = 0.9
+        soft_torque_limit: Positive = 0.9  # share of the force limit, of `torque_limits` [L: Cassie; L 1.0]
         soft_dof_vel_limit: Positive = 0.9  # share of asset.joint_speed_limits, of `dof_vel_limits` [L: Cassie; L 1.0]
-        # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
-        torques_as: Literal["norms", "squares"] = "norms"
+        torques_as: Literal["norms", "squares"] = "norms"  # `torques`: 2-norm plus 1-norm [P], or sum of squares [L]
 
         class scales:
-            """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off."""
+            """Reward terms: a number switches on the method _reward_<name>. A step's reward is number * dt * term."""
 
             _open = True
 
     class normalization:
-        # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
-        clip_actions: Positive = 2.0
+        clip_actions: Positive = 2.0  # bound of the action that is applied, penalised and observed [ours: P has none]
 
     class noise:
         level: NonNegative = 1.0  # multiplies every scale; 0: no noise [P]
@@ -182,17 +165,15 @@ class RobotTaskCfg(Config):
         interval: PositiveRange = [1.0, 3.0]  # pause between kicks [s] [P]
         duration: PositiveRange = [0.05, 0.2]  # [s] [P]
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
-        curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
-        # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
-        curriculum_rate: PositiveShare = 0.5
-        # kicks grow from none to all between these shares of a training, [0.2, 0.5]; empty: all at once [ours]
-        growth: Shares = []
+        curriculum: bool = False  # a world's dv grows from 0 with the share of an episode that it survives [ours]
+        curriculum_rate: PositiveShare = 0.5  # by this part of the difference at the end of each episode [ours]
+        growth: Shares = []  # kicks grow from none to all between these shares of a training; empty: at once [ours]
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
         max_push_vel_xy: Speed = 1.0  # each axis U(-max, max) [m/s] [L]
 
     class domain_rand:
-        """What differs between worlds. Two numbers are the ends of a uniform distribution; an empty list leaves the model's value."""
+        """What differs between worlds: ends of uniform distributions; an empty list leaves the model's value."""
 
         enable: bool = False  # [P]
         link_mass: Factors = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
@@ -200,44 +181,30 @@ class RobotTaskCfg(Config):
         base_com: Places = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
         armature: Factors = [1.0, 1.05]  # factor on each joint's [P]
         friction: Frictions = [0.4, 1.0]  # sliding friction of the ground [-] [P]
-        # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
-        contact_time: ContactTimes = []
+        contact_time: ContactTimes = []  # time constant of ground contacts (solref) [s]: longer is softer; MuJoCo 0.02
         frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: Factors = []  # factor on each servo's position gain
         damping: Factors = []  # factor on each joint's damping
         strength: Factors = []  # factor on each motor's force limit, asset.effort or the file's
-        encoder_offset: Offsets = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
+        encoder_offset: Offsets = [-0.05, 0.05]  # each encoder's reading minus the true angle [rad] [P]
         stall_torque: Factors = []  # factor on each motor's, of control.stall_torque
         no_load_speed: Factors = []  # factor on each motor's, of control.no_load_speed
         action_delay: StepDelays = []  # control steps from an action to its servo, whole numbers, both ends included
         delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
-        observation_delay: StepDelays = []  # control steps that what `state` measures is old
-        # [deg] of the plane, downhill along x, in place of terrain.slope: with any heading, any direction
-        slope: Slopes = []
-        # any other field of the model that may differ: a factor per world on all of it
-        model_factors: dict[str, Factors] = {}
+        observation_delay: StepDelays = []  # age of the measured rows of `state`, in control steps
+        slope: Slopes = []  # [deg] of the plane, downhill along x, in place of terrain.slope; headings are random
+        model_factors: dict[str, Factors] = {}  # any other field of the model: a factor per world on all of it
         redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
-            *[
-                "friction",
-                "contact_time",
-                "frictionloss",
-                "stiffness",
-                "damping",
-                "strength",
-                "stall_torque",
-                "no_load_speed",
-            ],
-            *["encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
+            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque"],
+            *["no_load_speed", "encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
         ]
-        # draw everything again every so many iterations of training, and when it is resumed; 0: never
-        redraw_iterations: NonNegativeInt = 0
-        observe: bool = False  # rows in `privileged_state` with what was drawn
+        redraw_iterations: NonNegativeInt = 0  # draw all again every so many iterations, and on resuming; 0: never
+        observe: bool = False  # rows in `privileged_state` with the drawn numbers
 
     class terrain:
         friction: NonNegative = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
         condim: Literal[1, 3, 4, 6] = 3  # contact dimensions: 3 is sliding without torsion [P]
-        # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
-        slope: Slope = 0.0
+        slope: Slope = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it do not
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
@@ -245,54 +212,41 @@ class RobotTaskCfg(Config):
         dt: TimeStep = 0.004  # simulation step [s] [P]
         iterations: SmallInt = 1  # Newton iterations [P]
         ls_iterations: SmallInt = 5  # line-search iterations [P]
-        # implicitfast: joint damping is stable however large [P: euler]
-        integrator: Literal["euler", "implicitfast"] = "euler"
-        fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
-        # contacts a world has room for (mujoco_warp); 0: counted from the model; see --check [ours: sim/capacity.py]
-        nconmax: NonNegativeInt = 0
-        # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
-        njmax: NonNegativeInt = 0
+        integrator: Literal["euler", "implicitfast"] = "euler"  # [P]; implicitfast: any joint damping is stable
+        fuse: bool = True  # compile the step's small operations into few kernels, equal to rounding [ours: docs/lab.md]
+        nconmax: NonNegativeInt = 0  # contacts a world (mujoco_warp); 0: by the model [ours: sim/capacity.py]
+        njmax: NonNegativeInt = 0  # constraint rows likewise: friction, limits, contacts; more cost memory and time
 
     class viewer:
         width: Pixels = 1280  # [pixel]
         height: Pixels = 720  # [pixel]
-        # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
-        camera: Camera = []
+        camera: Camera = []  # camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         fps: SmallInt = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
     def check(self) -> None:
-        """Raise ConfigError at the first value that fits its field, but not the others. What a field alone may hold stands in its type."""
+        """Raise ConfigError for a value that contradicts another one. Types bound a single value."""
         self._check_motors()
-        step = self.sim.dt * self.control.decimation
-        if self.env.episode_length_s < step:
-            raise ConfigError(
-                f"env.episode_length_s is {self.env.episode_length_s:g}, shorter than a control step of {step:g} s"
-            )
+        length, step = self.env.episode_length_s, self.sim.dt * self.control.decimation
+        if length < step:
+            raise ConfigError(f"env.episode_length_s is {length:g}, shorter than a control step of {step:g} s")
 
     def _check_motors(self) -> None:
         control, curve = self.control, self.control.stall_torque or self.control.no_load_speed
-        if control.actuator == "network" and not control.network:
-            raise ConfigError(
-                "control.actuator is 'network', but control.network names no file of weights (docs/motors.md)"
-            )
-        if control.actuator != "dc_motor" and control.action_origin == "speed":
-            raise ConfigError(
-                f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a "
-                "speed: name that one, or leave action_origin out"
-            )
-        if control.actuator == "torque" and control.action_origin != "default":
-            raise ConfigError(
-                f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' "
-                "an action is a torque: leave action_origin out"
-            )
+        law, origin = control.actuator, control.action_origin
+        if law == "network" and not control.network:
+            what = "but control.network names no file of weights (docs/motors.md)"
+            raise ConfigError(f"control.actuator is 'network', {what}")
+        if law != "dc_motor" and origin == "speed":
+            mend = "only a 'dc_motor' is driven by a speed: name that one, or leave action_origin out"
+            raise ConfigError(f"control.action_origin is 'speed', but control.actuator is {law!r}: {mend}")
+        if law == "torque" and origin != "default":
+            what = "an origin of angles, but under control.actuator 'torque' an action is a torque"
+            raise ConfigError(f"control.action_origin is {origin!r}, {what}: leave action_origin out")
         for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
-            wanted = control.actuator == "dc_motor" or (control.actuator != "servo" and curve)
+            wanted = law == "dc_motor" or (law != "servo" and curve)
             if wanted and not getattr(control, name):
-                raise ConfigError(
-                    f"control.actuator is {control.actuator!r} with a torque-speed curve, but control.{name} is empty: "
-                    f"fill the table [{unit}] a joint, '' for all (docs/motors.md)"
-                )
+                what = f"control.actuator is {law!r} with a torque-speed curve, but control.{name} is empty"
+                raise ConfigError(f"{what}: fill the table [{unit}] a joint, '' for all (docs/motors.md)")
             if self.domain_rand.enable and getattr(self.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
-                raise ConfigError(
-                    f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])"
-                )
+                what = f"domain_rand.{name} is a factor on control.{name}, which is empty"
+                raise ConfigError(f"{what}: fill it, or leave the range out ([])")

@@ -1,6 +1,6 @@
-"""Save and restore every tensor that an environment remembers, so that a resumed run goes on bit by bit.
+"""Save and restore every tensor of an environment, so that a resumed run continues bit-exactly.
 
-A list: what ``buffer`` and ``remember`` of the task were told, and the simulation's own memory.
+The list has the tensors that the task registered by ``buffer`` and ``remember``, and the simulation's own.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from legged_mw.sim.simulation import CONSTANTS_READ
 
 
 def memory(env: RobotTask) -> dict[str, Tensor]:
-    """All that a resumed run has as it was, by name."""
+    """All tensors that a resumed run restores, by name."""
     return {f"sim.{name}": value for name, value in env.sim.memory().items()} | env.remembered()
 
 
 def take_snapshot(env: RobotTask) -> dict[str, Tensor]:
-    """Copies on the host of ``memory``."""
+    """Copies of ``memory`` on the host."""
     return {name: value.detach().to("cpu", copy=True) for name, value in memory(env).items()}
 
 
 def put_snapshot(env: RobotTask, state: dict[str, Tensor]) -> str:
-    """Put back what ``take_snapshot`` returned. Returns why that cannot be, and then nothing has changed; '' if it is done."""
+    """Restore ``state`` of ``take_snapshot``. Returns '', or why that is impossible; then nothing has changed."""
     own = memory(env)
     if env.not_remembered:
         return env.not_remembered

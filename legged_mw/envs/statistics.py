@@ -1,9 +1,9 @@
-"""What a step counts: means over episodes, values that are not finite, worlds that broke. Recorded in the step: fixed buffers and masks.
+"""What a step counts: means over episodes, values that are not finite, and worlds that broke.
 
-Everything is added up on the device and read once an iteration. A reward or an observation that is NaN, infinite or absurdly
-large becomes 0 and is counted; what is as it should be keeps its bits. A state that is not finite ends an episode as "broken".
-One such world is an accident; many, step after step, are physics that cannot be stepped as the config has it, and a training in
-it must end. ``DivergenceStop`` decides that, on the host, once an iteration.
+Everything is added up on the device, in fixed buffers, and read once an iteration. A reward or an observation that is
+NaN, infinite or very large becomes 0 and is counted; all other values keep their bits. A state that is not finite ends
+an episode as "broken". One broken world is an accident. Many, step after step, mean that the config's physics cannot be
+simulated, and the training must end: ``DivergenceStop`` decides that on the host, once an iteration.
 """
 
 from __future__ import annotations
@@ -16,17 +16,15 @@ from torch import Tensor
 
 from legged_mw.sim.simulation import Simulation
 
-# name -> () a sum, or (2,) a sum and what to divide it by, as they stand when they are taken
-Live = Mapping[str, Tensor]
+Live = Mapping[str, Tensor]  # present values by name: () a sum, or (2,) a sum and what to divide it by
 # [ours: rewards are about 1 and rows, in their units, below 1e5; a mean or variance over 1e5 samples survives it]
 BOUND = 1e6
-# of an iteration's finished episodes: more that are not finite, in two iterations one after the other, end a training [ours]
-SHARE = 0.01
+SHARE = 0.01  # of an iteration's episodes: if more are broken in two iterations in a row, training ends [ours]
 JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: worlds so far that a joint broke, and that an action did
 
 
 class Statistics:
-    """Means over ended episodes, counts of episodes, and values as they stand. All travel as one vector, so that ranks can add theirs."""
+    """Means over ended episodes, counts of episodes, and present values: one vector, so that ranks can add theirs."""
 
     written = ("_sums",)
 
@@ -36,7 +34,7 @@ class Statistics:
         self._sums = torch.zeros(len(self.means) + len(self.counts), device=device)
 
     def add(self, ended: Tensor, means: Tensor, counts: Tensor) -> None:
-        """Add the worlds where ``ended`` (N,) is true: their ``means`` (N, M); and all worlds' ``counts`` (N, C)."""
+        """Add ``means`` (N, M) of the worlds where ``ended`` (N,) is true, and ``counts`` (N, C) of all worlds."""
         self._sums.add_(torch.cat([torch.where(ended[:, None], means, 0.0), counts], dim=1).sum(dim=0))
 
     def take(self, live: Live) -> Tensor:
@@ -47,7 +45,7 @@ class Statistics:
         return taken
 
     def name(self, taken: Sequence[float]) -> dict[str, float]:
-        """Means, counts and live values by name, from what ``take`` returned. Means are NaN where no episode ended."""
+        """Means, counts and present values by name, from ``take``'s vector. Means are NaN where no episode ended."""
         values = iter(taken)
         sums = {name: next(values) for name in [*self.means, *self.counts]}
         episodes = sums[self.counts[0]]
@@ -63,40 +61,41 @@ class Statistics:
 
 
 class NonFinite:
-    """Looks at K values of N worlds, each of something that has a name."""
+    """Clears and counts bad values among K named values of N worlds."""
 
     written = ("counts",)
 
     def __init__(self, names: Sequence[str], device: str) -> None:
-        """``names`` of the K columns, in words that a user knows."""
+        """``names`` of the K columns, in a user's words."""
         self.names = list(names)
-        self.counts = torch.zeros(len(self.names), device=device)  # (K,) worlds and steps, since they were taken
+        self.counts = torch.zeros(len(self.names), device=device)  # (K,) worlds and steps since ``take``
 
     def clear(self, values: Tensor) -> None:
-        """Put 0 in place of each of ``values`` (N, K) that is not finite or beyond BOUND, and count it."""
+        """Replace each of ``values`` (N, K) that is not finite or beyond BOUND by 0, and count it."""
         wrong = ~(values.abs() <= BOUND)  # NaN too
         self.counts.add_(wrong.sum(dim=0))
         values.masked_fill_(wrong, 0.0)
 
     def take(self) -> Tensor:
-        """The counts (K,), which begin from zero again."""
+        """The counts (K,); they start from zero again."""
         counts = self.counts.clone()
         self.counts.zero_()
         return counts
 
 
 class BrokenWorlds:
-    """Finds broken worlds and counts, since the start, the fastest joint of each."""
+    """Finds worlds with a state or an action that is not finite, and counts the fastest joint of each."""
 
     written = ("counts",)
 
     def __init__(self, sim: Simulation, actions: Tensor, joints: Sequence[str], max_speed: float) -> None:
-        """``actions`` (N, A) as the step has them; ``max_speed`` of any degree of freedom that still counts as finite."""
-        self._sim, self._actions, self._joints, self._max_speed = sim, actions, joints, max_speed
+        """``actions`` (N, A) is the step's buffer; a faster speed than ``max_speed`` counts as not finite."""
+        self._sim, self._actions, self._max_speed = sim, actions, max_speed
+        self._names = [*(f"{JOINT}{joint}" for joint in joints), ACTION]
         self.counts = torch.zeros(len(joints) + 1, device=sim.qvel.device)  # worlds by joint, and last by action
 
     def find(self, broken: Tensor) -> None:
-        """Write the worlds that broke in this step into ``broken`` (N,), and count what broke them: no joint where a speed is NaN."""
+        """Write the worlds that broke in this step into ``broken`` (N,), and count why (a NaN speed for no joint)."""
         speed = self._sim.qvel.abs()
         joints, position = speed[:, 6:], self._sim.qpos.abs().amax(dim=1)
         action = self._actions.abs().amax(dim=1) < math.inf  # a servo swallows NaN, the reward does not
@@ -106,19 +105,19 @@ class BrokenWorlds:
         self.counts.add_(torch.cat([fastest, (broken & ~action)[:, None]], dim=1).sum(dim=0))
 
     def statistics(self) -> dict[str, Tensor]:
-        """Worlds so far, () each, by what broke them."""
-        return {name: self.counts[i] for i, name in enumerate([*(f"{JOINT}{joint}" for joint in self._joints), ACTION])}
+        """Worlds that broke so far, () each, by cause."""
+        return dict(zip(self._names, self.counts, strict=True))
 
 
 class DivergenceStop:
-    """Says when an iteration's statistics mean that a training must end."""
+    """Decides from an iteration's statistics whether training must end."""
 
     def __init__(self) -> None:
-        self._good: Mapping[str, float] = {}  # statistics of the last iteration that was as it should be
-        self._before: Mapping[str, float] = {}  # of the last one, if too many were not finite
+        self._good: Mapping[str, float] = {}  # statistics of the last iteration with few broken worlds
+        self._before: Mapping[str, float] = {}  # of the last iteration, if it had many
 
     def verdict(self, numbers: Mapping[str, float]) -> str:
-        """Why training must end, in words; '' to go on. ``numbers`` are an iteration's statistics."""
+        """Why training must end; '' to go on. ``numbers`` are an iteration's statistics."""
         if not numbers["broken"] > SHARE * numbers["episodes"]:
             self._good, self._before = numbers, {}
             return ""
@@ -126,9 +125,8 @@ class DivergenceStop:
         if not before:
             return ""
         shares = " and ".join(f"{each['broken']:.0f} of {each['episodes']:.0f}" for each in (before, numbers))
-        counts = {
-            name: numbers[name] - self._good.get(name, 0.0) for name in numbers if name.startswith((JOINT, ACTION))
-        }
+        causes = [name for name in numbers if name.startswith((JOINT, ACTION))]
+        counts = {name: numbers[name] - self._good.get(name, 0.0) for name in causes}
         return f"in the last two iterations {shares} episodes ended with a state that is not finite: {_because(counts)}"
 
 
@@ -136,14 +134,13 @@ def _because(counts: dict[str, float]) -> str:
     """The cause and what to change, from the worlds that each joint and the actions broke."""
     action, total = counts.pop(ACTION, 0.0), sum(counts.values())
     if action > total:
-        return "the policy's actions are not finite; lower algorithm.learning_rate, and look for a reward term without a bound"
+        mend = "lower algorithm.learning_rate, and look for a reward term without a bound"
+        return f"the policy's actions are not finite; {mend}"
     worst = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])[:4]
-    joints = (
-        ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst)
-        or "none, all was lost at once"
-    )
+    joints = ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst)
     return (
-        f"physics diverges; fastest joint at the break: {joints}. Lower control.damping or control.stiffness of these joints, or give them "
-        "armature (asset.armature), or lower sim.dt and raise control.decimation, or set sim.integrator to implicitfast; "
+        f"physics diverges; fastest joint at the break: {joints or 'none, all was lost at once'}. "
+        "Lower control.damping or control.stiffness of these joints, or give them armature (asset.armature), "
+        "or lower sim.dt and raise control.decimation, or set sim.integrator to implicitfast; "
         "train.py --check --picture robot.png shows what each joint bears"
     )

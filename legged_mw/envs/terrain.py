@@ -1,8 +1,8 @@
-"""Which tile of the terrain each world is on, and how a world gets on to a harder one.
+"""Which tile of the terrain each world is on, and when it moves to a harder one.
 
-The rules are legged_gym's. A robot that leaves its tile goes one level up. One that covers less than half of what the
-command asked goes one level down. One that masters the last level goes to a random one. Progress is measured along the
-command, since a robot that turns on the spot as commanded goes nowhere.
+The rules are legged_gym's. A robot that leaves its tile goes one level up. One that covers less than half of the
+commanded distance goes one level down. One that masters the last level goes to a random one. Progress is measured along
+the command: a robot that is commanded to turn on the spot owes no distance.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from torch import Tensor
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.errors import ModelError
-from legged_mw.utils.math import assign
 
 FIELDS = {  # parameter of make_terrain -> the field that it comes from
     "proportions": "terrain.terrain_proportions",
@@ -24,7 +23,7 @@ FIELDS = {  # parameter of make_terrain -> the field that it comes from
 
 
 def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
-    """The ground that the section terrain describes; None: a plane."""
+    """The ground of the section ``terrain``; None: a plane."""
     ground = cfg.terrain
     if ground.mesh_type == "plane":
         return None
@@ -44,7 +43,7 @@ def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
 
 
 class Tiles:
-    """The tiles of N worlds. Everything is a fixed tensor and written in place, as a recorded step needs it."""
+    """The tiles of N worlds: fixed tensors, written in place."""
 
     written = ("levels", "origins")
 
@@ -53,33 +52,30 @@ class Tiles:
         highest = min(cfg.terrain.max_init_terrain_level, terrain.levels - 1) if self.curriculum else terrain.levels - 1
         self.levels = torch.randint(0, highest + 1, (num_envs,), device=device)  # (N,) row of the tile
         world = torch.arange(num_envs, device=device)
-        # (N,) fixed; few worlds take some of them
-        self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)
+        self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)  # (N,) fixed; few worlds skip some
         self._all_origins = torch.tensor(terrain.origins, dtype=torch.float, device=device)  # (levels, columns, 3)
         self.origins = self._all_origins[self.levels, self.columns]  # (N, 3) where an episode begins [m, world]
         tiles = torch.tensor([terrain.levels, len(terrain.kinds)], dtype=torch.float, device=device)
-        # x, y [m] beyond which a robot has left the terrain
-        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2
+        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2  # x, y [m]; beyond, a robot left the terrain
         self.kinds = tuple(dict.fromkeys(terrain.kinds))
         kind = torch.tensor([self.kinds.index(name) for name in terrain.kinds], device=device)[self.columns]
         self._is_kind = torch.nn.functional.one_hot(kind, len(self.kinds)).float()  # (N, kinds)
         self._count = self._is_kind.sum(dim=0)
 
     def put(self, levels: Tensor) -> None:
-        """Put each world on the level (N,) of its column; its next reset goes there."""
+        """Give each world the level (N,) in its column, for its next reset."""
         self.levels.copy_(levels)
         self.origins.copy_(self._all_origins[self.levels, self.columns])
 
     def promote(self, mask: Tensor, up: Tensor, down: Tensor) -> None:
-        """New levels where ``mask`` (N,) is true: one up, one down; above the last a random one."""
+        """New levels where ``mask`` (N,) is true: one up, one down; random above the last, or without a curriculum."""
         level = self.levels + up.long() - down.long()
         anywhere = torch.randint_like(level, self.num_levels)
         level = torch.where(level >= self.num_levels, anywhere, level.clamp(min=0)) if self.curriculum else anywhere
-        assign(self.levels, mask, level)
-        self.origins.copy_(self._all_origins[self.levels, self.columns])
+        self.put(torch.where(mask, level, self.levels))
 
     def statistics(self) -> dict[str, Tensor]:
-        """Mean level of all worlds and by kind of ground, each as a sum and a count (2,), so that ranks can add theirs."""
+        """Mean level of all worlds and by kind of ground, each as a sum and a count (2,)."""
         sums = torch.stack([self.levels.float() @ self._is_kind, self._count])  # (2, kinds)
         by_kind = {f"terrain_level/{kind}": sums[:, i] for i, kind in enumerate(self.kinds)}
         return {"terrain_level": sums.sum(dim=1), **by_kind}

@@ -154,7 +154,7 @@ def _observe_as(
         group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows]
         for group, rows in table.items()
     }
-    return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device, lambda width: None)
+    return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device)
 
 
 def _in_words(rows: Iterable[Row]) -> str:

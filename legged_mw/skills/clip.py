@@ -16,12 +16,12 @@ from legged_mw.utils.errors import UserError, unknown
 from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[np.float64]
-FARTHEST = 1e4  # [m] or [rad] of what a robot does in a clip
+LARGEST = 1e4  # [m] or [rad], the largest place or angle in a clip
 KEYS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")  # of a clip's .npz
 
 
 class ClipError(UserError, ValueError):
-    """A clip that cannot be used; the text states what is wrong and what to do."""
+    """A clip that cannot be used; the text says why and what to do."""
 
 
 class Clip(NamedTuple):
@@ -43,7 +43,7 @@ class Clip(NamedTuple):
         return np.concatenate([self.root_pos, self.root_quat, self.joint_pos], axis=1)
 
     def qvel(self) -> Floats:
-        """(T, 6 + D) root [m/s, world], its turning [rad/s, body], joints [rad/s]; central differences, at the ends one-sided."""
+        """(T, 6 + D) root [m/s, world], angular velocity [rad/s, body], joints [rad/s], by central differences."""
         # from frame to frame
         turn = rotation_vector(multiply(conjugate(self.root_quat[:-1]), self.root_quat[1:])) * self.fps
         turning = np.concatenate([turn[:1], (turn[:-1] + turn[1:]) / 2, turn[-1:]])
@@ -51,31 +51,28 @@ class Clip(NamedTuple):
         return np.concatenate([root, turning, joints], axis=1)
 
     def at(self, rate: float) -> Clip:
-        """The same motion with ``rate`` frames a second, between frames along straight lines and great circles."""
+        """The same motion with ``rate`` frames a second, interpolated linearly and along great circles."""
         if abs(rate - self.fps) < 1e-6:
             return self
         if not self.seconds * rate + 1e-6 >= 1:
-            raise ClipError(
-                f"{self.seconds:g} s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip"
-            )
+            what = f"{self.seconds:g} s have no two frames at {rate:g} frames a second"
+            raise ClipError(f"{what}; take a higher rate or a longer clip")
         places = np.arange(int(self.seconds * rate + 1e-6) + 1) / rate * self.fps
         first = np.minimum(places.astype(int), len(self.root_pos) - 2)
         share = (places - first)[:, None]
         here, there = self.root_quat[first], self.root_quat[first + 1]
         turned = multiply(here, from_rotation_vector(share * rotation_vector(multiply(conjugate(here), there))))
-        root, joints = (
-            (1 - share) * values[first] + share * values[first + 1] for values in (self.root_pos, self.joint_pos)
-        )
+        root = (1 - share) * self.root_pos[first] + share * self.root_pos[first + 1]
+        joints = (1 - share) * self.joint_pos[first] + share * self.joint_pos[first + 1]
         return Clip(rate, self.joint_names, root, turned, joints)
 
     def of(self, joints: Sequence[str], where: str) -> Clip:
-        """The same with these ``joints``, in their order; others are left out. Raises ClipError for one that it does not have."""
+        """The same motion of these ``joints`` alone, in their order. Raises ClipError for one that the clip lacks."""
         for name in joints:
             if name not in self.joint_names:
                 raise ClipError(f"{where}: {unknown('joint', name, self.joint_names, 'the clip')}")
-        return self._replace(
-            joint_names=tuple(joints), joint_pos=self.joint_pos[:, [self.joint_names.index(name) for name in joints]]
-        )
+        columns = [self.joint_names.index(name) for name in joints]
+        return self._replace(joint_names=tuple(joints), joint_pos=self.joint_pos[:, columns])
 
 
 def read_clip(path: Path) -> Clip:
@@ -88,7 +85,7 @@ def read_clip(path: Path) -> Clip:
 
 
 def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
-    """The clip of the arrays ``held``, which are from ``path``. Raises ClipError."""
+    """The clip of the arrays ``held`` of the file ``path``. Raises ClipError."""
     if missing := [key for key in KEYS if key not in held]:
         hint = f"convert it with: python -m legged_mw.motion {path.name} --task TASK --out CLIP.npz"
         raise ClipError(f"{path} is no clip of legged_mw, for it has no '{missing[0]}'; {hint}")
@@ -105,32 +102,25 @@ def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
 def checked(
     path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, root_quat: ArrayLike, joint_pos: ArrayLike
 ) -> Clip:
-    """A clip of these arrays, its quaternions of unit length and without jumps of sign. Raises ClipError."""
+    """A clip of these arrays, with unit quaternions that do not jump in sign. Raises ClipError."""
     pos, quat, joints = (np.array(values, dtype=np.float64) for values in (root_pos, root_quat, joint_pos))
-    if (
-        len(pos) < 2
-        or pos.shape != (len(pos), 3)
-        or quat.shape != (len(pos), 4)
-        or joints.shape != (len(pos), len(names))
-    ):
-        found = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape}"
-        raise ClipError(
-            f"{path}: {found} for {len(names)} joints; there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
-        )
+    frames = len(pos)
+    if frames < 2 or (pos.shape, quat.shape, joints.shape) != ((frames, 3), (frames, 4), (frames, len(names))):
+        found = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape} for {len(names)} joints"
+        wanted = f"there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
+        raise ClipError(f"{path}: {found}; {wanted}")
     length = np.linalg.norm(quat, axis=1, keepdims=True)
     finite = all(np.isfinite(values).all() for values in (pos, quat, joints))
     if not finite or not fps > 0 or (np.abs(length - 1.0) > 0.01).any():
-        raise ClipError(
-            f"{path}: the clip has a value that is not finite, a quaternion that is not of unit length, or no frame rate"
-        )
+        wrong = "a value that is not finite, a quaternion that is not of unit length, or no frame rate"
+        raise ClipError(f"{path}: the clip has {wrong}")
     if not 0.1 <= fps <= 1e5:
         raise ClipError(f"{path}: {fps:g} frames a second; there must be from 0.1 to 1e+05")
-    if max(np.abs(pos).max(), np.abs(joints).max(initial=0.0)) > FARTHEST or len({*names}) < len(names):
-        raise ClipError(f"{path}: the clip has a place or an angle beyond {FARTHEST:g} m or rad, or a joint twice")
-    flips = np.sign((quat[1:] * quat[:-1]).sum(axis=1))
-    return Clip(
-        fps, tuple(names), pos, quat / length * np.cumprod(np.r_[1.0, np.where(flips < 0, -1.0, 1.0)])[:, None], joints
-    )
+    if max(np.abs(pos).max(), np.abs(joints).max(initial=0.0)) > LARGEST or len({*names}) < len(names):
+        raise ClipError(f"{path}: the clip has a place or an angle beyond {LARGEST:g} m or rad, or a joint twice")
+    flips = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    sign = np.cumprod(np.r_[1.0, flips])[:, None]
+    return Clip(fps, tuple(names), pos, quat / length * sign, joints)
 
 
 def save_clip(path: Path, clip: Clip) -> None:
@@ -140,7 +130,7 @@ def save_clip(path: Path, clip: Clip) -> None:
     np.savez_compressed(path, joint_names=np.array(clip.joint_names), **arrays)  # type: ignore[arg-type]
 
 
-# ---- rotations ---------------------------------------------------------------------------------------------------------
+# ---- rotations -----------------------------------------------------------------------------------------------------
 
 
 def multiply(a: Floats, b: Floats) -> Floats:
@@ -162,7 +152,7 @@ def rotate(q: Floats, v: Floats) -> Floats:
 
 
 def heading(q: Floats) -> Floats:
-    """The turn about the vertical alone (..., 4)."""
+    """The part of a rotation about the vertical (..., 4)."""
     w, x, y, z = np.moveaxis(q, -1, 0)
     half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
     return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)

@@ -1,6 +1,6 @@
-"""States of a robot that was dropped with its motors off and came to lie, by MuJoCo's own engine. Host only.
+"""States of a robot after it was dropped with its motors off, by MuJoCo's own engine on the host.
 
-The same seed gives the same states on any machine and with any number of threads, whatever engine steps them later.
+The same seed gives the same states on any machine, with any number of threads, for any engine.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -15,25 +15,21 @@ from mujoco.batch import Batch
 
 from legged_mw.utils.machine import usable_cores
 
-# [N m s/rad] at least, of joints of one half and of the other: limp, and as motors that only brake
-DAMPING = (0.0, 5.0)
+DAMPING = (0.0, 5.0)  # [N m s/rad] at least, of the joints: half of the states limp, half as with braking motors
 VELOCITY = 0.5  # [m/s, rad/s] of the root when it is dropped: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
 CLEAR = 0.02  # [m] between the lowest point and the ground when it is dropped
-_CHUNK = 256  # worlds that are stepped together: memory
+_CHUNK = 256  # worlds stepped together, to bound memory
 
 
 def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """qpos (count, nq) and qvel (count, nv), ``seconds`` after a drop in any attitude with any joint angles.
 
-    ``model`` has a free joint, then hinges, and its ground is z = 0. Fewer states are the first of more.
+    ``model`` has a free joint, then hinges, and its ground is z = 0. A smaller ``count`` gives the first of the states.
     """
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    model.opt.integrator, model.opt.iterations, model.opt.ls_iterations = (
-        mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-        50,
-        50,
-    )
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.iterations, model.opt.ls_iterations = 50, 50
     starts = _drops(model, count, np.random.default_rng(seed))
     batch = Batch(model, min(_CHUNK, -(-count // 2)), usable_cores())
     found = [np.empty((count, size)) for size in (model.nq, model.nv)]
@@ -51,9 +47,9 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
 
 
 def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Any attitude, any joint angles within the ranges (of a joint without: +-pi), just above the ground."""
+    """Any attitude, any joint angles within the ranges (+-pi without one), just above the ground."""
     data, joints = mujoco.MjData(model), slice(1, model.njnt)
-    draw = rng.random((count, 9 + model.nq - 7))  # in one go, so that a state does not depend on how many there are
+    draw = rng.random((count, 9 + model.nq - 7))  # all at once, so that a state does not depend on ``count``
     # [Shoemake 1992: uniform attitudes]
     size, turn = np.sqrt([1.0 - draw[:, 6], draw[:, 6]]), 2.0 * np.pi * draw[:, 7:9].T
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-np.pi, np.pi]).T

@@ -1,4 +1,4 @@
-"""Get up from any fall, and stay standing in the default pose. Episodes begin in falls; a force lifts robots while they learn.
+"""Get up from any fall, and stay standing in the default pose. Episodes begin in falls; a force helps robots learn.
 
 Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobotLab), a G1; [ours] with the reason.
 """
@@ -22,9 +22,9 @@ from legged_mw.utils.math import assign
 
 Settling = Annotated[float, above(0, 60, "s")]
 
-# cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]
+# a robot is up above this cosine of the tilt (15 degrees) and share of standing height [ours: servos alone hold 0.92]
 UP_TILT, UP_HEIGHT = 0.966, 0.9
-# times: an episode that ends down raises the level by this much more than one that ends up lowers it [ours]
+# the lift's level rises by an episode that ends down so many times as much as it falls by one that ends up [ours]
 GIVEN_BACK = 3.0
 
 
@@ -34,9 +34,9 @@ class GetupCfg(SkillCfg):
         states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
         seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
         seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has its own
-        pull: Share = 0.0  # share of the weight that lifts a robot; it fades as they learn [H 0.6]
-        pull_on: str = ""  # body that it lifts; empty: the root, from which a robot whose trunk is heavier than its legs hangs head down
-        pull_fades: PositiveShare = 0.2  # of it, when every world has ended an episode up [ours]
+        pull: Share = 0.0  # lifting force, as a share of the weight; it fades as robots learn [H 0.6]
+        pull_on: str = ""  # body that it lifts; empty: the root (a robot with a heavy trunk then hangs head down)
+        pull_fades: PositiveShare = 0.2  # share by which it falls when every world has ended an episode up [ours]
 
     class env(SkillCfg.env):
         episode_length_s = 6.0  # [s] [P]
@@ -45,7 +45,7 @@ class GetupCfg(SkillCfg):
         self_collisions = True  # and all colliders touch the ground [P]
 
     class control(SkillCfg.control):
-        # [P, H: about the default pose noise turns no robot over; docs/skills.md], [rad] [P]
+        # [P, H: around the default pose, noise never rolls a robot over; docs/skills.md], [rad] [P]
         action_origin, action_scale = "joints", 0.5
 
     class termination(SkillCfg.termination):
@@ -55,26 +55,25 @@ class GetupCfg(SkillCfg):
         # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
         base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.25, 1.2]
         stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
-        slope = [0.0, 12.0]  # [deg] [ours: the exam asks 10]
+        slope = [0.0, 12.0]  # [deg] [ours: the exam has 10]
 
     class exam:
-        within: Seconds = 3.0  # [s] in which it must stand
+        within: Seconds = 3.0  # [s] to stand up in
 
     class rewards(SkillCfg.rewards):
-        # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
-        only_positive_rewards = False
+        only_positive_rewards = False  # [ours, P True: no fall ends an episode, and thrashing would cost nothing]
 
         class scales(SkillCfg.rewards.scales):  # [P], with our terms of the same meaning
             upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
             action_rate, action_smoothness, torques, dof_acc, dof_pos_limits = -0.005, -0.001, -1e-5, -1e-8, -0.1
-            # [ours, P -0.1 and dof_acc -2.5e-7: at first the noise would cost ten times what it gains]
+            # [ours, P -0.1 and dof_acc -2.5e-7: at first these penalties would be ten times the rewards]
             fast_joints = -0.0003
 
 
 class GetupCfgPPO(SkillCfgPPO):
     class actor(SkillCfgPPO.actor):
         class distribution_cfg(SkillCfgPPO.actor.distribution_cfg):
-            # [ours: those that stand want less noise, before the others have found how to turn over]
+            # [ours: standing robots would lower the noise before the others have learned to roll over]
             init_std, std_range = 1.0, [0.2, 1e6]
 
     class algorithm(SkillCfgPPO.algorithm):
@@ -84,24 +83,23 @@ class GetupCfgPPO(SkillCfgPPO):
 class LiftAssist:
     """A force against gravity on a body of each robot: ``level`` (), from 1 to 0, times ``force`` [N].
 
-    One that is up keeps it: else robots learn to lean in it rather than to stand without, and it never fades.
+    Robots that already stand are lifted too. Otherwise they learn to lean on the force and it never fades.
     """
 
     written = ("level",)
 
     def __init__(self, sim: Simulation, body: int, gravity_dir: Tensor, force: float, fades: float) -> None:
-        """``gravity_dir``: (N, 3) in the world, which leans where a slope was drawn. ``fades``: by how much the level falls when
-        every world has ended an episode up."""
+        """``gravity_dir`` (N, 3), world frame, leans on a drawn slope. ``fades`` is ``falls.pull_fades``."""
         self._force, self._down, self._fades = sim.xfrc_applied[:, body, :3], gravity_dir, fades  # a view (N, 3)
         self._highest, self.level = force, torch.ones((), device=sim.device)
 
     def apply(self) -> None:
-        """Before a step."""
+        """Write the force, before a step."""
         if self._highest:
             torch.mul(self._down, -self._highest * self.level, out=self._force)
 
     def update(self, ended: Tensor, up: Tensor) -> None:
-        """Episodes have ended, (N,) each."""
+        """Lower the level by the worlds that ``ended`` (N,) an episode ``up`` (N,), raise it by those that did not."""
         if self._highest:
             change = torch.where(up, -1.0, GIVEN_BACK).masked_fill(~ended, 0.0).mean()
             self.level.add_(change, alpha=self._fades).clamp_(0.0, 1.0)
@@ -122,12 +120,9 @@ class Getup(RobotTask):
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
         self.upright = self.buffer()  # (N,) cosine of the tilt
-        self.up = self.buffer(dtype=torch.bool)  # (N,) as high and upright as one that stands
-        self.pull = self.remember(
-            LiftAssist(
-                self.sim, self._lifted(), self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades
-            )
-        )
+        self.up = self.buffer(dtype=torch.bool)  # (N,) as high and upright as a standing robot
+        force = falls.pull * 9.81 * self.total_mass
+        self.pull = self.remember(LiftAssist(self.sim, self._lifted(), self.gravity_dir, force, falls.pull_fades))
 
     def _lifted(self) -> int:
         """The body that ``falls.pull`` lifts."""
@@ -137,13 +132,12 @@ class Getup(RobotTask):
             raise ConfigError(f"falls.pull_on: {unknown('body', falls.pull_on, names, self.cfg.asset.file)}")
         lifted = model.body(falls.pull_on).id if falls.pull_on else self.root_body
         if falls.pull and lifted == self.root_body and self.cfg.perturbation.kick:
-            raise ConfigError(
-                "falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on"
-            )
+            mend = "name another body in falls.pull_on"
+            raise ConfigError(f"falls.pull lifts the root, which perturbation.kick pushes: {mend}")
         return lifted
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Standing as any task begins, or, by chance, in one of the settled falls."""
+        """Standing, or with probability ``falls.share`` in one of the settled falls."""
         super()._reset_robots(mask)
         fall = mask & (torch.rand_like(self.rew_buf) < self.cfg.falls.share)
         pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)
@@ -156,7 +150,7 @@ class Getup(RobotTask):
 
     def _update_curricula(self, mask: Tensor) -> None:
         super()._update_curricula(mask)
-        self.pull.update(mask & (self.episode_steps[:, 0] > 0.0), self.up)
+        self.pull.update(mask, self.up)
 
     def _live_statistics(self) -> dict[str, Tensor]:
         return super()._live_statistics() | self.pull.statistics()
@@ -181,18 +175,18 @@ class Getup(RobotTask):
         return torch.exp(-4.0 * (1.0 - self.upright))  # exp(-2 |g + z|^2) of unit vectors [P]
 
     def _reward_upright(self) -> Tensor:
-        """How upright it is. [P: the second half alone, which is nothing from its side on; ours: the other is even over all angles]"""
+        """How upright it is. [P: the second half alone, 0 once it lies; ours: a half that is linear in the tilt]"""
         return 0.5 - torch.acos(self.upright.clamp(-1.0, 1.0)) / (2.0 * torch.pi) + 0.5 * self._near_upright()
 
     def _reward_height(self) -> Tensor:
-        """Height of the root, a share of standing, less the less upright. [P: exp(height) - 1; ours: none for standing on its back]"""
+        """Height of the root, as a share of standing, times uprightness. [P: exp(height) - 1; ours: 0 upside down]"""
         return (self.base_height / self.up_height).clamp(0.0, 1.0) * (0.5 + 0.5 * self.upright)
 
     def _reward_posture(self) -> Tensor:
-        """The default pose, as far as it is upright. [P: exp(-0.5 x sum), which is flat where the legs are folded; ours: by the mean]"""
+        """The default pose, while upright. [P: exp(-0.5 x sum), which is flat for folded legs; ours: by the mean]"""
         return self._near_upright() * torch.exp(-2.0 * (self.dof_offset.square() * self.pose_weights).mean(dim=1))
 
     def _reward_stand_still(self) -> Tensor:
-        """Joints at rest, the more it is up. [P: small actions, and all or nothing; ours: what the exam asks]"""
+        """Joints at rest, while it is up. [P: small actions, all or nothing; ours: as the exam]"""
         high = ((self.base_height / self.up_height - 0.6) / 0.3).clamp(0.0, 1.0)
         return self._near_upright() * high * torch.exp(-0.5 * self.dof_vel.square().mean(dim=1))

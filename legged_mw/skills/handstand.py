@@ -1,7 +1,8 @@
-"""Handstand and footstand: from standing on all legs to two of them, and staying there. The class, its config and its learner's.
+"""Handstand and footstand: from standing on all legs to two of them, and staying there. Task, config, learner's config.
 
-Source [P]: MuJoCo Playground's Go1 handstand and footstand (commit d5e6b47); [ours] with the reason. Which legs may touch the ground:
-the paper penalises those in the air, the code since a047305 any foot. As in the paper, here the legs that carry the robot are free to.
+Source [P]: MuJoCo Playground's Go1 handstand and footstand (commit d5e6b47); [ours] with the reason. The paper
+penalises ground contacts of the legs in the air, Playground's code since a047305 those of any foot. Here it is as in
+the paper.
 """
 
 from __future__ import annotations
@@ -21,15 +22,14 @@ class HandstandCfg(SkillCfg):
         episode_length_s = 10.0  # [s] [P]
 
     class exam:
-        """What is asked, of the reward and in the exam."""
+        """The goal of the reward and of the exam."""
 
         nose: Sign = -1.0  # -1 down, a handstand; 1 up, a footstand
-        height: Positive = 0.55  # [m] of the root that is high enough [P]
-        hands: list[str] = []  # geoms that stand: nothing else may touch the ground
+        height: Positive = 0.55  # [m] of the root that suffices [P]
+        hands: list[str] = []  # geoms that the robot stands on; no other may touch the ground
 
     class control(SkillCfg.control):
-        # [rad] [ours, of the default pose; P 0.3 of the last targets, and no row says where they are]
-        action_scale = 0.5
+        action_scale = 0.5  # [rad] [ours, from the default pose; P 0.3 from the last targets, which no row shows]
 
     class normalization(SkillCfg.normalization):
         clip_actions = 4.0  # [ours: the thighs turn by 1.6 rad]
@@ -43,11 +43,10 @@ class HandstandCfg(SkillCfg):
     class rewards(SkillCfg.rewards):
         soft_dof_pos_limit = 0.9  # [P]
 
-        # [P]; what it calls pose and contact is here joint_deviation, of angles, and collision
-        class scales(SkillCfg.rewards.scales):
+        class scales(SkillCfg.rewards.scales):  # [P]: its pose is joint_deviation here, its contact collision
             stand_height, stand_attitude = 1.0, 1.0
             collision, dof_pos_limits, joint_deviation = -0.1, -0.5, -0.1
-            # [P in its fine-tuning 0, -0.003, -2.5e-7: as much as it gains, at first]
+            # [P, in its fine-tuning, 0, -0.003, -2.5e-7: at first as large as the rewards]
             action_rate, energy, dof_acc = -0.002, -1e-4, -1e-8
 
 
@@ -73,5 +72,5 @@ class Handstand(RobotTask):
         return torch.exp(self.base_height.clamp(max=self.cfg.exam.height) - self.cfg.exam.height)
 
     def _reward_stand_attitude(self) -> Tensor:
-        """The root's x axis points down, or up: 1; level: a quarter; the other way: 0. [P]"""
+        """1 where the root's x axis points as ``exam.nose``, 0.25 where it is level, 0 the other way. [P]"""
         return (0.5 - 0.5 * self.cfg.exam.nose * self.projected_gravity[:, 0]).square()

@@ -1,6 +1,6 @@
-"""Where bodies of a robot are and how they move, from qpos and qvel alone: batched torch, for the moment that they describe.
+"""Poses and velocities of a robot's bodies from qpos and qvel, in batched torch.
 
-What an engine keeps of bodies is one simulation step old, and zero in a world just reset; this is neither.
+The engine's body poses lag one substep and are zero after a reset. These are current.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -31,10 +31,9 @@ class Kinematics:
     """Forward kinematics of a robot with a free root and hinges, at most one a body."""
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[int], device: str) -> None:
-        """``bodies``: which of ``model``, in the order that is returned."""
-        root = next(
-            b for b in range(1, model.nbody) if model.body_jntnum[b] and model.jnt_type[model.body_jntadr[b]] == 0
-        )
+        """``bodies`` are indices in ``model``; the call returns them in this order."""
+        jointed = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
+        root = next(b for b in jointed if model.jnt_type[model.body_jntadr[b]] == mujoco.mjtJoint.mjJNT_FREE)
         levels = _levels(model, root, bodies)
         order = [body for level in levels for body in level]
         joints = [_joint(model, body) for body in order[1:]]
@@ -57,22 +56,19 @@ class Kinematics:
 
         self._constant, self._sine, self._cosine, self._above = map(tensor, (constant, sine, cosine, above[..., None]))
         self._products, self._identity = tensor(_matrix_of_products()), tensor(np.eye(3).ravel())
-        self._zero, self._axis, self._anchor = (
-            tensor(model.qpos0[7:]),
-            tensor(model.jnt_axis[hinges]),
-            tensor(model.jnt_pos[hinges]),
-        )
+        self._zero = tensor(model.qpos0[7:])
+        self._axis, self._anchor = tensor(model.jnt_axis[hinges]), tensor(model.jnt_pos[hinges])
         # a body without a joint: sine is 0
         self._angle_of = places([model.jnt_qposadr[j] - 7 if j >= 0 else 0 for j in joints])
         self._speed_of = places([model.jnt_dofadr[j] for j in hinges])
         self._carried = places([order.index(int(model.jnt_bodyid[j])) for j in hinges])
         self._wanted = places([order.index(body) for body in bodies])
-        parents = [
-            [above_.index(int(model.body_parentid[b])) for b in level]
-            for above_, level in zip(levels, levels[1:], strict=False)
-        ]
-        starts = np.cumsum([0, *(len(level) for level in levels[1:])])
-        self._levels = [(places(of), slice(starts[i], starts[i + 1])) for i, of in enumerate(parents)]
+        # each level below the root: its parents in the level above, and its span in ``order``
+        self._levels, start = list[tuple[Tensor, slice]](), 0
+        for upper, level in zip(levels, levels[1:], strict=False):
+            parents = [upper.index(int(model.body_parentid[body])) for body in level]
+            self._levels.append((places(parents), slice(start, start + len(level))))
+            start += len(level)
 
     def __call__(self, qpos: Tensor, qvel: Tensor) -> Bodies:
         """The bodies in the states ``qpos`` (N, nq), ``qvel`` (N, nv)."""
@@ -87,7 +83,7 @@ class Kinematics:
         carried, wanted = every.index_select(1, self._carried), every.index_select(1, self._wanted)
         axis = rotate(carried[..., :3], self._axis) * qvel.index_select(1, self._speed_of)[..., None]
         anchor = rotate(carried[..., :3], self._anchor) + carried[..., 3]
-        # of each hinge: turning, and velocity of what is at the root
+        # of each hinge: angular velocity, and linear velocity at the root
         twist = torch.cat([axis, torch.linalg.cross(anchor, axis)], dim=2)
         turning, moving = (self._above * twist[:, None]).sum(dim=2).split(3, dim=2)
         turning = turning + rotate(frames[0][..., :3], qvel[:, None, 3:6])
@@ -97,7 +93,7 @@ class Kinematics:
 
 
 def rotate(turn: Tensor, vector: Tensor) -> Tensor:
-    """A matrix (..., n, k) times ``vector`` (..., k). Sums of products: a GPU may round matrix products to ten bits."""
+    """A matrix (..., n, k) times ``vector`` (..., k), by sums: a GPU may round matrix products to ten bits."""
     return (turn * vector.unsqueeze(-2)).sum(dim=-1)
 
 
@@ -107,7 +103,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _matrix_of_products() -> np.ndarray:
-    """(9, 16): what turns the products of a unit quaternion's entries into its rotation matrix, less the identity."""
+    """(9, 16) from the products of a unit quaternion's entries to its rotation matrix minus the identity."""
     w, x, y, z = range(4)
     terms = np.zeros((3, 3, 4, 4))
     for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
@@ -118,15 +114,14 @@ def _matrix_of_products() -> np.ndarray:
 
 
 def _levels(model: mujoco.MjModel, root: int, bodies: Sequence[int]) -> list[list[int]]:
-    """The bodies and what carries them, by how many others are between them and the root."""
+    """The bodies and their ancestors, sorted by their depth below the root."""
     depth = {root: 0}
     for body in bodies:
         chain = [body]
         while chain[-1] not in depth:
             if chain[-1] == 0:
-                raise ModelError(
-                    f"body '{model.body(body).name}' is not carried by the robot's root '{model.body(root).name}'"
-                )
+                name, top = model.body(body).name, model.body(root).name
+                raise ModelError(f"body '{name}' is not carried by the robot's root '{top}'")
             chain.append(int(model.body_parentid[chain[-1]]))
         for each in reversed(chain[:-1]):
             depth[each] = depth[int(model.body_parentid[each])] + 1
@@ -134,12 +129,11 @@ def _levels(model: mujoco.MjModel, root: int, bodies: Sequence[int]) -> list[lis
 
 
 def _joint(model: mujoco.MjModel, body: int) -> int:
-    """The joint by which ``body`` moves against its parent; -1 for none."""
+    """The hinge between ``body`` and its parent; -1 for none."""
     count, first = int(model.body_jntnum[body]), int(model.body_jntadr[body])
     if count > 1 or (count and model.jnt_type[first] != mujoco.mjtJoint.mjJNT_HINGE):
-        raise ModelError(
-            f"body '{model.body(body).name}' moves by more than one hinge; kinematics in torch know one hinge a body"
-        )
+        what = f"body '{model.body(body).name}' moves by more than one hinge"
+        raise ModelError(f"{what}; kinematics in torch know one hinge a body")
     return first if count else -1
 
 

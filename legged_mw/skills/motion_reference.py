@@ -1,4 +1,7 @@
-"""Reference clips as fixed tensors: where each world is in them, and where new episodes begin. Shapes: N worlds, B bodies, M frames."""
+"""Reference clips as fixed tensors: the frame of each world, and the start of new episodes.
+
+Shapes: N worlds, B bodies, M frames.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,14 @@ from legged_mw.utils.files import find_file
 
 
 class Reference:
-    """Clips one after another, each followed by its last frame, held. Every world has a frame that it is to reach in the step to come."""
+    """Clips one after another, each with its last frame held. ``frame`` is each world's target in the next step."""
 
     written = ("frame", "failures", "_row", "wanted_pos", "wanted_rot")
 
     def __init__(
         self, clips: Sequence[Clip], kinematics: Kinematics, num_envs: int, device: str, *, held: int, bin_frames: int
     ) -> None:
-        """``held``: frames that a clip's last one is held for. New episodes begin in bins of some ``bin_frames`` frames."""
+        """A clip's last frame is held for ``held`` frames. Bins for new episodes have about ``bin_frames`` frames."""
 
         def places(values: Sequence[int]) -> Tensor:
             return torch.tensor(list(values), dtype=torch.long, device=device)
@@ -29,25 +32,22 @@ class Reference:
         tables, last, bins, bin_of = [], [], [], []
         for clip in clips:
             start, count = len(last), len(clip.root_pos)
-            qpos, qvel = (
-                torch.tensor(values, dtype=torch.float, device=device) for values in (clip.qpos(), clip.qvel())
-            )
+            states = clip.qpos(), clip.qvel()
+            qpos, qvel = (torch.tensor(values, dtype=torch.float, device=device) for values in states)
             still = torch.cat([qpos[-1:], torch.zeros_like(qvel[-1:])], dim=1).expand(held, -1)
             state = torch.cat([torch.cat([qpos, qvel], dim=1), still])
             bodies = kinematics(*state.split([qpos.shape[1], qvel.shape[1]], dim=1))
             tables.append(torch.cat([state, *(part.flatten(1) for part in bodies)], dim=1))
             parts = max(1, round((count - 1) / bin_frames))
             edges = [start + (count - 1) * i // parts for i in range(parts + 1)]
-            bin_of += [len(bins) + min(i * parts // (count - 1), parts - 1) for i in range(count)] + [
-                len(bins) + parts - 1
-            ] * held
+            bin_of += [len(bins) + min(i * parts // (count - 1), parts - 1) for i in range(count)]
+            bin_of += [len(bins) + parts - 1] * held
             bins += [(low, high - low) for low, high in zip(edges, edges[1:], strict=False)]
             last += [start + count - 1 + held] * (count + held)
         self._table = torch.cat(tables)  # (M, W)
         self._last, self._bin_of, self._bins = places(last), places(bin_of), torch.tensor(bins, device=device)
         self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)  # (N,)
-        # share of the worlds that fall there in a step, as remembered
-        self.failures = torch.zeros(len(bins), device=device)
+        self.failures = torch.zeros(len(bins), device=device)  # average share of worlds that fall there in a step
         self._row = torch.zeros(num_envs, self._table.shape[1], device=device)
         widths = [qpos.shape[1], qvel.shape[1], *(part[0].numel() for part in bodies)]
         self.qpos, self.qvel, *parts = self._row.split(widths, dim=1)
@@ -56,11 +56,11 @@ class Reference:
         self.wanted_pos, self.wanted_rot = torch.zeros_like(self.bodies.pos), torch.zeros_like(self.bodies.rot)
 
     def read(self) -> None:
-        """What the present frames are."""
+        """Read the worlds' frames from the table."""
         torch.index_select(self._table, 0, self.frame, out=self._row)
 
     def align(self, body: Bodies, anchor: int) -> None:
-        """The bodies of the present frames at a robot's ``anchor``: there in x and y, at the clip's height, with the robot's heading."""
+        """Move the frames' bodies to a robot's ``anchor``: its x, y and heading, but the clip's height."""
         ours, theirs = body.rot[:, anchor], self.bodies.rot[:, anchor]
         cos, sin = (ours[:, :2] * theirs[:, :1]).sum(dim=2).unbind(dim=1)  # of the turn between both, seen from above
         size = torch.hypot(cos, sin).clamp(min=1e-6)
@@ -72,20 +72,20 @@ class Reference:
         self.wanted_rot.copy_(product(turn, self.bodies.rot))
 
     def advance(self) -> None:
-        """The next frame, where there is one."""
+        """Go to the next frame, if there is one."""
         self.frame.copy_(torch.minimum(self.frame + 1, self._last.index_select(0, self.frame)))
 
     def over(self) -> Tensor:
-        """(N,) Where the last frame has come, the held ones too."""
+        """(N,) The last frame is reached, held ones included."""
         return self.frame >= self._last.index_select(0, self.frame)
 
     def remember_failures(self, fell: Tensor, rate: float) -> None:
-        """Worlds ``fell`` (N,) at their present frame: a moving average of their share in each bin. [BeyondMimic]"""
+        """Update the moving average of failures in each bin with the worlds that ``fell`` (N,). [BeyondMimic]"""
         count = torch.zeros_like(self.failures).scatter_add_(0, self._bin_of.index_select(0, self.frame), fell.float())
         self.failures.lerp_(count / len(fell), rate)
 
     def draw(self, uniform: float) -> Tensor:
-        """(N,) Frames to begin at: a bin by its failures, or, of a share of ``uniform``, any; then anywhere in it. [BeyondMimic]"""
+        """(N,) Start frames, uniform in a bin; bins by failures, for a share ``uniform`` equally. [BeyondMimic]"""
         chance = torch.rand(2, len(self.frame), device=self.frame.device)
         weights = self.failures / self.failures.sum().clamp(min=1e-9) * (1.0 - uniform) + uniform / len(self.failures)
         weights = weights.cumsum(0)
@@ -94,9 +94,9 @@ class Reference:
         return first + torch.minimum((chance[1] * count).long(), count - 1)
 
     def begin(self, mask: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Where ``mask`` (N,) is true the frame after ``start`` (N,) is next; None: the first clip's first.
+        """Begin at the frames ``start`` (N,) where ``mask`` (N,) is true; None: the first clip's first frame.
 
-        Returns the states at ``start``: qpos (N, nq), qvel (N, nv).
+        Returns the states at ``start``: qpos (N, nq), qvel (N, nv). The next frame is the target.
         """
         start = torch.zeros_like(self.frame) if start is None else start
         self.frame.copy_(torch.where(mask, start + 1, self.frame))
@@ -106,7 +106,7 @@ class Reference:
 
 
 def load_clips(cfg: MotionTrackingCfg, joints: Sequence[str], rate: float) -> list[Clip]:
-    """The clips of ``motion.clips`` with these ``joints``, at ``rate`` frames a second."""
+    """The clips ``motion.clips`` of these ``joints``, at ``rate`` frames a second."""
     files = [find_file(cfg, "motion.clips", name) for name in cfg.motion.clips]
     return [read_clip(file).at(rate).of(joints, file.name) for file in files]
 

@@ -1,7 +1,7 @@
-"""A robot follows reference clips, read top to bottom. What every task shares is in ``robot_task``, and its rules hold here too.
+"""A robot follows reference clips, read top to bottom. The rules of ``robot_task`` hold here too.
 
-The recipe is BeyondMimic's [B] (arXiv 2508.08241), as its code and mjlab's [M] have it. Shapes: N worlds, D joints, B bodies.
-Everything is compared at the anchor: the reference is moved to where the robot's anchor is, and turned to its heading.
+The recipe is BeyondMimic's [B] (arXiv 2508.08241), as in its code and mjlab's [M]. Bodies are compared at the anchor:
+the reference is moved to the robot's anchor and turned to its heading. Shapes: N worlds, D joints, B bodies.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class MotionTracking(RobotTask):
     cfg: MotionTrackingCfg
     exam = "tracking"
 
-    # ---- the step -------------------------------------------------------------------------------------------------
+    # ---- the step ---------------------------------------------------------------------------------------------------
 
     def _refresh_base(self) -> None:
         super()._refresh_base()
@@ -46,9 +46,8 @@ class MotionTracking(RobotTask):
         down = super()._fallen()
         down |= (ours.pos[:, self.anchor, 2] - theirs.pos[:, self.anchor, 2]).abs() > end.max_anchor_height
         down |= (ours.rot[:, self.anchor, 2, 2] - theirs.rot[:, self.anchor, 2, 2]).abs() > end.max_anchor_tilt
-        down |= (
-            (ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs() > end.max_end_height
-        ).any(dim=1)
+        off = (ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs()
+        down |= (off > end.max_end_height).any(dim=1)
         return down
 
     def _timed_out(self) -> Tensor:
@@ -56,15 +55,11 @@ class MotionTracking(RobotTask):
         return super()._timed_out() | self.reference.over()
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Robots near the reference, at a frame that the failures draw."""
+        """Robots near the reference, at a frame drawn by past failures."""
         motion = self.cfg.motion
         qpos, qvel = self.reference.begin(mask, self.reference.draw(motion.uniform) if motion.random_start else None)
-        off = (
-            torch.rand(self.num_envs, len(self.start_range), device=self.device)
-            .mul_(2.0)
-            .sub_(1.0)
-            .mul_(self.start_range)
-        )
+        off = torch.rand(self.num_envs, len(self.start_range), device=self.device).mul_(2.0).sub_(1.0)
+        off.mul_(self.start_range)
         place, turn, speed, bend = off.split([3, 3, 6, self.num_actions], dim=1)
         attitude = quat_multiply(rotation_quat(turn), qpos[:, 3:7])
         joints = (qpos[:, 7:] + bend).clamp(self.soft_lower, self.soft_upper)
@@ -73,7 +68,7 @@ class MotionTracking(RobotTask):
         self.actuators.reset(mask)
         self.observations.restart(mask)
 
-    # ---- observations ---------------------------------------------------------------------------------------------------
+    # ---- observations -----------------------------------------------------------------------------------------------
 
     def compute_observations(self) -> None:
         self.reference.read()
@@ -87,7 +82,7 @@ class MotionTracking(RobotTask):
         super().compute_observations()
 
     def _anchor_seen(self) -> tuple[Tensor, Tensor]:
-        """Place (N, 3) [m] and attitude (N, 3, 3) of the anchor as a robot finds them: by encoders that may be off."""
+        """Place (N, 3) [m] and attitude (N, 3, 3) of the anchor by the robot's encoders, which may have offsets."""
         if self.actuators.encoder_offset is None:
             return self.body.pos[:, self.anchor], self.body.rot[:, self.anchor]
         joints = self.dof_pos + self.actuators.encoder_offset
@@ -104,10 +99,8 @@ class MotionTracking(RobotTask):
             Row("anchor_pos", self.anchor_pos, mirror="polar"),
             Row("anchor_ori", self.anchor_ori, mirror="turn"),
         ]
-        seen = [
-            row._replace(noise=level, measured=True)
-            for row, level in zip(anchors, (noise.anchor_pos, noise.anchor_ori), strict=True)
-        ]
+        levels = noise.anchor_pos, noise.anchor_ori
+        seen = [row._replace(noise=level, measured=True) for row, level in zip(anchors, levels, strict=True)]
         return {
             "state": [*clip, *seen, *(row for row in self._measured_rows() if row.name != "projected_gravity")],
             "privileged_state": [
@@ -124,7 +117,7 @@ class MotionTracking(RobotTask):
     def _mirror_blocks(self) -> dict[str, Block]:
         return super()._mirror_blocks() | body_blocks(self.robot, self._partners(), self.cfg.motion.bodies)
 
-    # ---- rewards ----------------------------------------------------------------------------------------------------------
+    # ---- rewards ----------------------------------------------------------------------------------------------------
 
     def _near(self, squares: Tensor, sigma: float) -> Tensor:
         """(N,) 1 where the mean of ``squares`` (N, bodies) is 0."""
@@ -142,15 +135,13 @@ class MotionTracking(RobotTask):
 
     def _reward_tracking_body_pos(self) -> Tensor:
         """The bodies' places, at the anchor. [B]"""
-        return self._near(
-            (self.body.pos - self.reference.wanted_pos).square().sum(dim=2), self.cfg.rewards.body_pos_sigma
-        )
+        off = self.body.pos - self.reference.wanted_pos
+        return self._near(off.square().sum(dim=2), self.cfg.rewards.body_pos_sigma)
 
     def _reward_tracking_body_ori(self) -> Tensor:
         """The bodies' attitudes, at the anchor. [B]"""
-        return self._near(
-            angle_between(self.body.rot, self.reference.wanted_rot).square(), self.cfg.rewards.body_ori_sigma
-        )
+        off = angle_between(self.body.rot, self.reference.wanted_rot)
+        return self._near(off.square(), self.cfg.rewards.body_ori_sigma)
 
     def _reward_tracking_body_lin_vel(self) -> Tensor:
         """The bodies' velocities, world frame. [B]"""
@@ -165,17 +156,16 @@ class MotionTracking(RobotTask):
     def _live_statistics(self) -> dict[str, Tensor]:
         """Mean distance of the bodies from the reference, at the anchor [mm]."""
         off = ((self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0).nan_to_num(0.0, 0.0, 0.0)
-        return super()._live_statistics() | {
-            "body_error_mm": torch.stack([off.sum(), torch.full_like(off[0], len(off))])
-        }
+        mean = torch.stack([off.sum(), torch.full_like(off[0], len(off))])
+        return super()._live_statistics() | {"body_error_mm": mean}
 
-    # ---- checkpoint, buffers ------------------------------------------------------------------------------------------------
+    # ---- checkpoint, buffers ----------------------------------------------------------------------------------------
 
     def training_state(self) -> dict[str, Tensor]:
         return {**super().training_state(), "motion_failures": self.reference.failures.clone()}
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from ``training_state``, with new episodes, unless the clips are others."""
+        """Continue from ``training_state`` with new episodes, unless the clips have changed."""
         super().load_training_state(state)
         if "motion_failures" in state and state["motion_failures"].shape == self.reference.failures.shape:
             self.reference.failures.copy_(state["motion_failures"])
@@ -185,9 +175,8 @@ class MotionTracking(RobotTask):
         super()._init_buffers()
         motion = self.cfg.motion
         self.anchor = motion.bodies.index(motion.anchor)
-        self.ends = torch.tensor(
-            [motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device
-        )
+        ends = [motion.bodies.index(name) for name in motion.end_bodies]
+        self.ends = torch.tensor(ends, dtype=torch.long, device=self.device)
         bodies = [self.robot.id("body", name) for name in motion.bodies]
         self.kinematics = Kinematics(self.robot.physics, bodies, self.device)
         self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
@@ -197,6 +186,5 @@ class MotionTracking(RobotTask):
         ranges = [*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel]
         self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)
         self.body = self.remember(Bodies(*(torch.zeros_like(part) for part in self.reference.bodies)))
-        self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(
-            self.buffer, (3, 6, 3 * len(bodies), 6 * len(bodies))
-        )
+        self.anchor_pos, self.anchor_ori = self.buffer(3), self.buffer(6)
+        self.body_pos, self.body_ori = self.buffer(3 * len(bodies)), self.buffer(6 * len(bodies))

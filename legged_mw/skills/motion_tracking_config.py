@@ -1,4 +1,4 @@
-"""What following a motion adds to RobotTask's fields, once, typed, with unit and source. Tasks override these in configs/.
+"""The fields that following a motion adds to RobotTask's, typed, with unit and source.
 
 Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] with the reason.
 """
@@ -10,7 +10,7 @@ from legged_mw.utils.bounds import Duration, FileNames, NonNegative, NonNegative
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-_BEGINNINGS = {  # of init_state, which an episode that begins in a clip does not read -> of motion, which it does
+_BEGINNINGS = {  # fields of init_state that are not read, as episodes begin in a clip -> fields of motion instead
     "pos_xy_range": "start_pos",
     "yaw_range": "start_turn",
     "lin_vel_range": "start_lin_vel",
@@ -27,18 +27,17 @@ class MotionTrackingCfg(RobotTaskCfg):
 
     class motion:
         clips: FileNames = []  # .npz as `python -m legged_mw.motion --out` writes them; any frame rate
-        bodies: list[str] = []  # that are compared
-        anchor: str = ""  # one of them, at which they are
-        end_bodies: list[str] = []  # of them: far too high or low with one of these, it fell
+        bodies: list[str] = []  # bodies to compare with the reference
+        anchor: str = ""  # the one of them at which they are compared
+        end_bodies: list[str] = []  # those of them that mean a fall when far too high or low
         # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
         random_start: bool = True
-        # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
-        hold_s: Duration = 1.0
+        hold_s: Duration = 1.0  # the last frame is held so long, then the episode times out [s] [ours: as deploy]
         bin_s: Seconds = 1.0  # length of a bin [s]
         failure_rate: PositiveShare = 0.001  # share of a step in the moving average of the failures in each bin
-        # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]
+        # share of the episodes that begin in any bin [-] [ours: B's code adds it to failures, where it is negligible]
         uniform: PositiveShare = 0.1
-        # off the reference as an episode begins, each U(-range, range): x, y, z [m]
+        # offsets from the reference as an episode begins, each U(-range, range): x, y, z [m]
         start_pos: NonNegativeVector = [0.05, 0.05, 0.01]
         start_turn: NonNegativeVector = [0.1, 0.1, 0.2]  # about x, y, z [rad]
         start_lin_vel: NonNegativeVector = [0.5, 0.5, 0.2]  # [m/s]
@@ -46,8 +45,8 @@ class MotionTrackingCfg(RobotTaskCfg):
         start_joints: NonNegative = 0.1  # each joint, within its soft limits [rad]
 
     class termination(RobotTaskCfg.termination):
-        max_anchor_height: Positive = 0.25  # between the anchor's height and its reference's; beyond it, it fell [m]
-        max_anchor_tilt: Positive = 0.8  # between their vertical axes' heights, of 1 [-]
+        max_anchor_height: Positive = 0.25  # between the anchor's height and its reference's; more is a fall [m]
+        max_anchor_tilt: Positive = 0.8  # between the z components of their z axes [-]
         max_end_height: Positive = 0.25  # between the heights of an end body [m]
 
     class rewards(RobotTaskCfg.rewards):
@@ -55,7 +54,7 @@ class MotionTrackingCfg(RobotTaskCfg):
         soft_dof_pos_limit = 0.9
         anchor_pos_sigma: Positive = 0.3  # a term is exp(-(error / sigma)^2) [m]
         anchor_ori_sigma: Positive = 0.4  # [rad]
-        body_pos_sigma: Positive = 0.3  # the error: root mean square of all bodies [m]
+        body_pos_sigma: Positive = 0.3  # error: root mean square over the bodies [m]
         body_ori_sigma: Positive = 0.4  # [rad]
         body_lin_vel_sigma: Positive = 1.0  # [m/s]
         body_ang_vel_sigma: Positive = 3.14  # [rad/s]
@@ -84,12 +83,10 @@ class MotionTrackingCfg(RobotTaskCfg):
                 if name not in motion.bodies:
                     raise ConfigError(f"motion.{field}: {unknown('body', name, motion.bodies, 'motion.bodies')}")
         if not motion.clips:
-            raise ConfigError(
-                "motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it"
-            )
+            mend = "name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it"
+            raise ConfigError(f"motion.clips is empty; {mend}")
         given, default = self.init_state, MotionTrackingCfg.init_state
         if unread := [name for name in _BEGINNINGS if getattr(given, name) != getattr(default, name)]:
             names, instead = ", ".join(unread), ", ".join(dict.fromkeys(_BEGINNINGS[name] for name in unread))
-            raise ConfigError(
-                f"init_state: {names}: not read here, as episodes begin in a motion; leave out, and write motion: {instead}"
-            )
+            why = "not read here, as episodes begin in a motion"
+            raise ConfigError(f"init_state: {names}: {why}; leave out, and write motion: {instead}")

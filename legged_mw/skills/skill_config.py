@@ -1,4 +1,4 @@
-"""What getting up and standing on two legs share: worlds, what a robot knows, and a learner that suits.
+"""Config shared by getting up and standing on two legs: worlds, observations and the learner.
 
 Source [P]: MuJoCo Playground's Go1 getup, handstand and footstand (commit d5e6b47); [ours] with the reason.
 """
@@ -21,7 +21,7 @@ class SkillCfg(RobotTaskCfg):
         encoder_offset = [-0.015, 0.015]  # [rad]
 
     class sim(RobotTaskCfg.sim):
-        iterations, ls_iterations = 3, 10  # [ours: a robot that lies has many contacts]
+        iterations, ls_iterations = 3, 10  # [ours: a lying robot has many contacts]
 
 
 class SkillCfgPPO(RobotTaskCfgPPO):
