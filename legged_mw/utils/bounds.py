@@ -10,10 +10,11 @@ A number is finite whatever its type. Errors and the reference of fields show th
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
+
+from legged_mw.utils.errors import CONTROL
 
 
 class Bound(NamedTuple):
@@ -37,13 +38,11 @@ def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
     return Bound(f"{text}{unit and f' {unit}'}", lambda value: low < value <= most)
 
 
-_NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _ALWAYS = {
     float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # no unit of a config needs more
     # more than any machine counts, and few enough digits to print
     int: Bound("below 10^24", lambda value: abs(value) < 10**24),
-    # which rule a terminal, or no file takes
-    str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),
+    str: Bound("text without control characters", lambda value: not CONTROL.search(value)),
 }
 
 

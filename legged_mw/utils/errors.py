@@ -16,6 +16,8 @@ from typing import Any
 from legged_mw.utils.renamed import LEGGED_GYM_TENSORS, MOVED
 
 _LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
+# A terminal obeys these, and no file can hold the last.
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _STANDARD = sysconfig.get_paths()["stdlib"]
 
 
