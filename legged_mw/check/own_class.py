@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from legged_mw.utils.errors import StepError, place_of
-from legged_mw.utils.renamed import LEGGED_GYM_METHODS
 
 HOOKS = (  # every step or reset needs what their parents do; hooks of commands may be replaced
     *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
@@ -23,6 +22,21 @@ PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )
+# What a class ported from legged_gym may define, which nothing here calls -> what is called. docs/from_legged_gym.md
+LEGGED_GYM_METHODS: dict[str, str] = {
+    "post_physics_step": "_step()",
+    "_post_physics_step_callback": "_update_state() and _end_step()",
+    "_get_noise_scale_vec": "observation_rows()",
+    "reset_idx": "reset_envs(mask)",
+    "anneal": "on_training_progress(share)",  # not legged_gym's: ours, before
+    "_reset_dofs": "_reset_robots(mask)",
+    "_reset_root_states": "_reset_robots(mask)",
+    "update_command_curriculum": "_update_command_curriculum(mask)",
+    "_get_heights": "_scan_heights()",
+    "_push_robots": "perturbation.push of the config",
+    **dict.fromkeys(("create_sim", "_create_envs"), "_load_robot()"),
+    **dict.fromkeys(("_process_rigid_shape_props", "_process_dof_props", "_process_rigid_body_props"), "_load_robot()"),
+}
 
 
 def own_classes(env_class: type) -> list[type]:

@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 
 from legged_mw.deploy.reader import ContractError, Reader
 from legged_mw.utils.files import digest
-from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
-from legged_mw.utils.motor_network import Floats, MotorNetwork, read_network
+from legged_mw.utils.motor_network import (
+    DC_CONSTANT,
+    DC_DAMPING,
+    DC_RESISTANCE,
+    DC_STIFFNESS,
+    Floats,
+    MotorNetwork,
+    read_network,
+)
 
 MOTORS, MOTORS_FILE = "motors", "motors.npz"
 LAWS = ("servo", "dc_motor", "torque", "network")  # docs/motors.md

@@ -81,7 +81,7 @@ class Reader:
 
 def compile_scene(file: Path) -> Any:
     """The model in an export's scene. Raises ContractError."""
-    from legged_mw.utils.mjcf import Source, check_model  # which bring MuJoCo
+    from legged_mw.robot.mjcf import Source, check_model  # which bring MuJoCo
 
     try:
         model = Source(file, alone=True).spec().compile()

@@ -35,9 +35,9 @@ from legged_mw.deploy.contract import (
 from legged_mw.deploy.motion import ATTITUDE, POSITION
 from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
+from legged_mw.robot.mjcf import Source, check_model
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
-from legged_mw.utils.mjcf import Source, check_model
 
 Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state

@@ -12,9 +12,9 @@ from xml.sax.saxutils import escape
 import mujoco
 
 from legged_mw.robot.meshes import path_of
+from legged_mw.robot.mjcf import Source
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.robot_file import naming
-from legged_mw.utils.mjcf import Source
 
 
 def stands_alone(file: Path) -> bool:

@@ -22,7 +22,6 @@ from weakref import WeakKeyDictionary
 from legged_mw.utils.bounds import bare, bounds_of, bounds_text
 from legged_mw.utils.errors import ConfigError, brief
 from legged_mw.utils.files import note_file
-from legged_mw.utils.renamed import new_name
 from legged_mw.utils.yaml_file import load_yaml, parse_yaml, save_yaml
 
 __all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_yaml", "save_yaml", "type_text"]
@@ -86,7 +85,7 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
     if annotated:
         kind = _declared_type(cls, name, inherited)
     elif inherited is None and not getattr(cls, "_open", False):
-        hint = _suggest(path, known) + (f"; {_path(cls.__bases__[0])} has: {', '.join(known)}" if known else "")
+        hint = _nearest(name, known) + (f"; {_path(cls.__bases__[0])} has: {', '.join(known)}" if known else "")
         declaration = f"`{name}: {type(value).__name__} = {value!r}`"
         raise ConfigError(f"{path} overrides nothing{hint}; if the field is new, declare it with a type: {declaration}")
     else:
@@ -193,12 +192,6 @@ def type_text(kind: Any) -> str:
 def _full(kind: Any) -> str:
     """A type with its bounds."""
     return type_text(kind) + (f" ({bounds})" if (bounds := bounds_text(kind)) else "")
-
-
-def _suggest(path: str, fields: Mapping[str, Any]) -> str:
-    """`; it is called ... now` where the field at `path` was renamed, else `_nearest`."""
-    new = new_name(path)
-    return f"; it is called {new} now" if new else _nearest(path.rpartition(".")[2], fields)
 
 
 def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
@@ -321,7 +314,7 @@ def _kind(cls: type, name: str, path: str) -> Any:
     if is_free and getattr(cls, "_open", False):
         return float
     owner = path.rpartition(".")[0] or _path(cls)
-    raise ConfigError(f"{path} does not exist{_suggest(path, fields)}; {owner} has: {', '.join(fields)}")
+    raise ConfigError(f"{path} does not exist{_nearest(name, fields)}; {owner} has: {', '.join(fields)}")
 
 
 def _guarded_setattr(self: Any, name: str, value: Any) -> None:

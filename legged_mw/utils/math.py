@@ -59,19 +59,6 @@ def maybe_any(mask: Tensor) -> bool:
     return mask.device.type != "cpu" or tracing() or bool(mask.any())
 
 
-def alike(expected: Tensor, value: Tensor, close: float, strays: float) -> bool:
-    """Equal to ``close``, relative and absolute, but for a share of ``strays``; fewer than 100 values each to a hundredth.
-
-    Reads the device.
-    """
-    few = value.numel() < 100
-    if few:
-        close = max(close, 0.01)
-    floats = value.is_floating_point()
-    other = ~torch.isclose(expected, value, rtol=close, atol=close, equal_nan=True) if floats else expected != value
-    return int(other.sum()) <= (0 if few else 1 + strays * value.numel())
-
-
 def spread(values: Tensor, count: int) -> Tensor:
     """Values (M, ...) of M worlds for ``count`` worlds, each that of the nearest."""
     return values[torch.arange(count, device=values.device) * len(values) // count]

@@ -18,6 +18,7 @@ from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[Any]  # float32
 ACTIVATIONS = ("elu", "relu", "softsign", "tanh")
+DC_RESISTANCE, DC_CONSTANT, DC_STIFFNESS, DC_DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 _RECURRENT = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _SCALES = ("error_scale", "speed_scale", "torque_scale")
 
@@ -46,22 +47,13 @@ class MotorNetwork:
         return [layer[1].shape[1] for layer in self.recurrent]
 
     def to_arrays(self) -> dict[str, Any]:
-        """What the .npz holds."""
-        layers = {
-            f"{name}_l{i}": value
-            for i, layer in enumerate(self.recurrent)
-            for name, value in zip(_RECURRENT, layer, strict=True)
-        }
+        """The arrays of its .npz."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ("activation", "in_turns", *_SCALES)}
+        for i, layer in enumerate(self.recurrent):
+            arrays |= {f"{name}_l{i}": value for name, value in zip(_RECURRENT, layer, strict=True)}
         for i, (weight, bias) in enumerate(self.linear):
-            layers |= {f"weight{i}": weight, f"bias{i}": bias}
-        scales = {name: getattr(self, name) for name in _SCALES}
-        return {
-            **layers,
-            "activation": self.activation,
-            "frames": np.array(self.frames),
-            "in_turns": self.in_turns,
-            **scales,
-        }
+            arrays |= {f"weight{i}": weight, f"bias{i}": bias}
+        return {**arrays, "frames": np.array(self.frames)}
 
 
 def read_network(file: Path) -> MotorNetwork:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import shlex
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -17,8 +16,7 @@ from typing import Any, NamedTuple
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import UserError, in_short, shown, unknown, users_fault
-from legged_mw.utils.files import file_of, find_file, typed
-from legged_mw.utils.renamed import with_new_names
+from legged_mw.utils.files import typed
 
 _ENDS = "must end with TASK = Task(Env, Cfg, CfgPPO)"
 PRESETS = "base"  # configs/base.py: what tasks extend, no task
@@ -69,53 +67,10 @@ class LoadedTask:
             self.cfg.update(before, where=where)
             raise
 
-    def update_from_run(self, saved: Mapping[str, Any], where: str) -> list[str]:
-        """Take over the ``config.yaml`` of a run; it must be one of this task. Its old names are read as the new ones.
-
-        A learner's section that the file lacks, since it is older than the section, is what it was then: the base class's,
-        not the task's of today. Returns the names of such sections.
-        """
-        saved = self._with_own_file(with_new_names(saved))
-        theirs = str(saved.get("task", self.name))
-        if Path(theirs).stem != self.name:
-            what = f"say --task {theirs}" if of_project(theirs) else f"that is {somebodys(theirs)}"
-            raise ConfigError(f"{where} is of task {theirs[:200]!r}, not '{self.name}'; {what}")
-        base = next(
-            kind for kind in reversed(type(self.train).__mro__) if issubclass(kind, Config) and kind is not Config
-        )()
-        older = {name: value for name, value in base.to_dict().items() if name not in saved and isinstance(value, dict)}
-        self.update({**saved, **older}, where)
-        return list(older)
-
-    def _with_own_file(self, saved: Mapping[str, Any]) -> Mapping[str, Any]:
-        """``saved`` without an absolute ``asset.file`` that is the task's own: runs once stored the path of their machine."""
-        asset = saved.get("asset")
-        file = Path(str(asset.get("file", ""))) if isinstance(asset, Mapping) else Path()
-        if asset is None or not file.is_absolute() or file.name != Path(self.cfg.asset.file).name:
-            return saved
-        if file.exists() and not file.samefile(find_file(self.cfg, "asset.file")):
-            return saved
-        return {**saved, "asset": {**asset, "file": self.cfg.asset.file}}
-
     def changes_since(self, before: LoadedTask) -> dict[str, tuple[Any, Any]]:
         """Dotted path -> (value in ``before``, value now) of every field that differs; ``before`` is a copy of this task."""
         differences = [*before.cfg.diff(self.cfg), *before.train.diff(self.train)]
         return {path: (then, now) for path, then, now in differences}
-
-    def fit_cpu(self, cores: int) -> None:
-        """Take over what the section ``cpu`` says, for ``cores`` cores."""
-        train, few = self.train, self.train.cpu
-        self.cfg.env.num_envs = min(self.cfg.env.num_envs, few.envs_per_core * cores)
-        train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
-        train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = (
-            few.num_learning_epochs,
-            few.num_mini_batches,
-        )
-        train.algorithm.desired_kl = few.desired_kl
-        train.actor.hidden_dims = train.critic.hidden_dims = few.hidden_dims
-        train.actor.rnn_hidden_dim = train.critic.rnn_hidden_dim = few.rnn_hidden_dim
-        for path, value in few.overrides.items():
-            self.set(path, value, where="cpu.overrides")
 
     def to_dict(self) -> dict[str, Any]:
         """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds.
@@ -127,11 +82,6 @@ class LoadedTask:
             together = os.path.commonpath([here, file]) != here.anchor
             name = Path(os.path.relpath(file, here)).as_posix() if together else file.name
         return {"task": name, **self.cfg.to_dict(), **self.train.to_dict()}
-
-    def file_called(self, name: str) -> Path | None:
-        """The file of that ``name`` among the task's own and those of the configs that it extends: they have been run."""
-        kinds = (*type(self.cfg).__mro__, *type(self.train).__mro__)
-        return next((file for file in (self.path, *map(file_of, kinds)) if file and file.name == name), None)
 
     @property
     def ships(self) -> bool:
@@ -145,35 +95,10 @@ class LoadedTask:
         return sections[section]
 
 
-def of_project(stored: str) -> str:
-    """``--task`` for the task that a run's config names, if it is this project's; "" for any other file, which no run may start.
-
-    The project's are the names in configs/, and files that really lie in configs/ or examples/ of ``ROOT``, the package or the clone.
-    """
-    if Path(stored).suffix != ".py":
-        return stored  # a name; there is none outside of configs/
-    folders = [(ROOT / name).resolve() for name in ("configs", "examples")]
-    with suppress(OSError, ValueError, RuntimeError):  # a name that no file can have, a link to itself
-        for file in ((place / stored).resolve() for place in (Path.cwd(), ROOT)):
-            if file.is_file() and file.parent in folders:
-                return str(file)
-    return ""
-
-
-def somebodys(stored: str) -> str:
-    """What a task's file that is not ``of_project`` is, and the flag that runs it."""
-    return f"somebody's code, which no run starts by itself: read it, then say --task {shlex.quote(stored[:200])}"
-
-
 def task_names() -> list[str]:
     """Names that ``--task`` knows without a path."""
     names = [path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_")]
     return sorted(name for name in names if name != PRESETS)
-
-
-def list_tasks() -> str:
-    """A line a task: its name and the first line of its file."""
-    return "\n".join(f"{name:<16} {load_task(name).about}" for name in task_names())
 
 
 def load_task(name: str, say: bool = False) -> LoadedTask:

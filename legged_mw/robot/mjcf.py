@@ -24,7 +24,6 @@ import mujoco
 import numpy as np
 
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
-DC_RESISTANCE, DC_CONSTANT, DC_STIFFNESS, DC_DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 _INSIDE = "model.xml"
 MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
 # of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
