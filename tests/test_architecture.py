@@ -64,6 +64,7 @@ ONLY_IN = {
         ),
         "legged_mw/tools/*",
         "legged_mw/programs.py",
+        "examples/udp_robot.py",
     ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/fast/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],

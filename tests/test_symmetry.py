@@ -19,7 +19,7 @@ from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.rl.runs import update_from_run
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners

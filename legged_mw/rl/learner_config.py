@@ -8,24 +8,26 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from legged_mw.utils.bounds import (
+    SOME,
     Bound,
     Count,
-    Iterations,
     NonNegative,
     NonNegativeInt,
     Positive,
     PositiveRange,
     PositiveShare,
-    Seed,
     Share,
-    Sizes,
     SmallInt,
     Threads,
+    at_least,
 )
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.files import MOST_LETTERS, wrong_name
 from legged_mw.utils.task import LoadedTask
 
+Iterations = Annotated[int, at_least(0, 1_000_000)]
+Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
+Sizes = Annotated[list[Count], SOME]  # of layers
 FolderPart = Annotated[
     str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))
 ]

@@ -26,8 +26,8 @@ from legged_mw.rl.runs import (
     load_tensors,
     runs,
     task_of,
-    update_from_run,
 )
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import printable, shown
 from legged_mw.utils.files import check_folder, finish_moving, typed

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import os
 import re
-import shlex
-from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -15,21 +12,14 @@ from typing import Any
 
 import torch
 
-from legged_mw import ROOT
 from legged_mw.rl.checkpoint import EARLIER, check_content, damage, sealed
-from legged_mw.utils.config import Config, ConfigError, load_yaml
+from legged_mw.rl.saved_config import of_project, somebodys
+from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown, unknown
-from legged_mw.utils.files import check_folder, check_name, file_of, find_file, typed
-from legged_mw.utils.renamed import MOVED
+from legged_mw.utils.files import check_folder, check_name, typed
 from legged_mw.utils.task import LoadedTask
 
 CONFIG_FILE = "config.yaml"
-# A field of runs of 0.1 -> the keys that lead to its value now.
-RENAMED: dict[str, tuple[str, ...]] = {
-    "perturbation.enable": ("perturbation", "kick"),
-    "cpu.keep_probability": ("cpu", "overrides", "commands.keep_probability"),
-    "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
-}
 
 
 def logs_folder() -> Path:
@@ -109,14 +99,10 @@ def task_of(run: Path, named: LoadedTask | None = None) -> str:
     stored = load_yaml(run / CONFIG_FILE).get("task", "")
     if not isinstance(stored, str) or not stored:
         raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
-    if found := _of_project(stored):
-        return found
-    if named:
-        known = (named.path, *(file_of(kind) for cfg in (named.cfg, named.train) for kind in type(cfg).__mro__))
-        if found := next((file for file in known if file and file.name == Path(stored).name), None):
-            return str(found)
+    if found := of_project(stored) or (named and named.file_called(Path(stored).name)):
+        return str(found)
     raise ConfigError(
-        f"{shown(run)} is of task {stored[:200]!r}, {_somebodys(stored)}{', or a task that extends its config' if named else ''}"
+        f"{shown(run)} is of task {stored[:200]!r}, {somebodys(stored)}{', or a task that extends its config' if named else ''}"
     )
 
 
@@ -124,73 +110,6 @@ def task_at(path: str) -> str:
     """``task_of`` the run that the user named by its path; "" if there is no run."""
     run = typed(path)
     return task_of(check_folder(run)) if (run / CONFIG_FILE).is_file() else ""
-
-
-def _of_project(stored: str) -> str:
-    """``--task`` for the task that a run's config names, if it is this project's; "" for another file, which no run may start.
-
-    This project's are the names in configs/, and files that really lie in configs/ or examples/ of the package or the clone.
-    """
-    if Path(stored).suffix != ".py":
-        return stored  # a name; there is none outside of configs/
-    folders = [(ROOT / name).resolve() for name in ("configs", "examples")]
-    with suppress(OSError, ValueError, RuntimeError):  # a name that no file can have, a link to itself
-        for file in ((place / stored).resolve() for place in (Path.cwd(), ROOT)):
-            if file.is_file() and file.parent in folders:
-                return str(file)
-    return ""
-
-
-def _somebodys(stored: str) -> str:
-    return f"somebody's code, which no run starts by itself: read it, then say --task {shlex.quote(stored[:200])}"
-
-
-def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> list[str]:
-    """Give ``task`` the fields in the ``config.yaml`` of one of its runs, which may use old names.
-
-    A learner's section that the file lacks is newer than the run. It takes the base class's values, as the run did, not those
-    of today's task. Returns the names of these sections.
-    """
-    saved = _with_new_names(saved)
-    theirs = str(saved.get("task", task.name))
-    if Path(theirs).stem != task.name:
-        what = f"say --task {theirs}" if _of_project(theirs) else f"that is {_somebodys(theirs)}"
-        raise ConfigError(f"{where} is of task {theirs[:200]!r}, not '{task.name}'; {what}")
-    asset = saved.get("asset")
-    if isinstance(asset, dict) and _is_own_file(task, Path(str(asset.get("file", "")))):
-        asset["file"] = task.cfg.asset.file
-    parents = [kind for kind in type(task.train).__mro__ if issubclass(kind, Config) and kind is not Config]
-    defaults = parents[-1]().to_dict()
-    newer = {name: value for name, value in defaults.items() if name not in saved and isinstance(value, dict)}
-    task.update({**saved, **newer}, where)
-    return list(newer)
-
-
-def _with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy in which every old name of a field, or of a class's module, is replaced by the new one."""
-    config: dict[str, Any] = copy.deepcopy(dict(saved))
-    for old, (*sections, name) in RENAMED.items():
-        section, _, field = old.partition(".")
-        if not isinstance(config.get(section), dict) or field not in config[section]:
-            continue
-        value, node = config[section].pop(field), config
-        for key in sections:
-            node = node.setdefault(key, {}) if isinstance(node, dict) else None
-        if isinstance(node, dict):  # else the file is wrong there, and loading it says so
-            node[name] = value
-    for section in config.values():
-        name = section.get("class_name") if isinstance(section, dict) else None
-        for old, new in MOVED.items():
-            if isinstance(name, str) and name.startswith((f"{old}:", f"{old}.")):
-                section["class_name"] = new + name[len(old) :]
-    return config
-
-
-def _is_own_file(task: LoadedTask, file: Path) -> bool:
-    """Whether an absolute path is the task's own robot: runs once stored the path of their machine."""
-    if not file.is_absolute() or file.name != Path(task.cfg.asset.file).name:
-        return False
-    return not file.exists() or file.samefile(find_file(task.cfg, "asset.file"))
 
 
 def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:

@@ -30,7 +30,8 @@ from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
 from legged_mw.rl.recorded import Recorded
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, update_from_run
+from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
     TEACHER,
     attach_teacher_observations,

@@ -28,7 +28,7 @@ _IN_COMPILER = {"angle", "autolimits"}
 _IN_DEFAULT = {"default", "joint"}  # of its main class, which is that of what we add, too
 _IN_BODY = {"body", "freejoint", "joint", "inertial", "geom", "site"}
 _NOT_NEGATIVE = {"mass", "density", "diaginertia", "armature", "frictionloss"}
-_MOST_BYTES, _LARGEST = 1 << 20, 1e5
+_MOST_BYTES, _LARGEST = 1 << 20, 1e5  # of a plain file; of its numbers, in any unit, and of the mass [kg]
 # names of what is added around a robot: by sim.ground, and to be looked at
 SCENE = re.compile(r"(floor|ground|around|relief|sky)(/.*)?")
 
@@ -93,7 +93,9 @@ def read_plain(file: Path) -> RobotFile | None:
             model = compile_copy(spec)
     except (OSError, ValueError, ParseError, RecursionError):
         return None
-    return None if said else RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
+    if said or not model.body_mass.sum() <= _LARGEST:
+        return None
+    return RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
 
 
 def _is_plain(root: Element) -> bool:

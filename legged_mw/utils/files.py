@@ -31,10 +31,10 @@ def note_file(cls: type) -> type:
 
 
 def find_file(cfg: Any, path: str, one: str = "") -> Path:
-    """The file that the config field ``path`` ("asset.file") names, or ``one`` of those that it lists. Raises UserError.
+    """The file named by the config field ``path`` ("asset.file"), or ``one`` of those that it lists. Raises UserError.
 
-    A relative name in a class body is looked for beside the file of that class. A name from a flag or a run is looked for in
-    the current folder, beside the task, and beside the classes that it extends. The repository comes last.
+    A relative name in a class body is looked for beside the file of that class. A name from a flag or a run is looked
+    for in the current folder, beside the task, and beside the classes that it extends. The repository comes last.
     """
     section, _, name = path.rpartition(".")
     owner = getattr(cfg, section)
@@ -116,7 +116,7 @@ def typed(path: str) -> Path:
 
 
 def check_folder(folder: Path) -> Path:
-    """``folder``, a run or an export, perhaps a stranger's. Raises UserError unless it holds files, folders and inner links alone.
+    """A run or an export, perhaps a stranger's. Raises UserError unless it holds files, folders and inner links alone.
 
     A link out of it would let another file be read or overwritten; reading a pipe would never end.
     """
@@ -158,7 +158,7 @@ def finish_moving(folder: Path) -> None:
 
 
 def read_arrays(file: Path) -> dict[str, Any]:
-    """The arrays in the .npz ``file``, read without running code. Raises ValueError if it is missing, damaged or no .npz."""
+    """The arrays in the .npz ``file``. Runs no code from it. Raises ValueError if it is missing or damaged."""
     import numpy as np  # not at the top: programs start without it
 
     try:

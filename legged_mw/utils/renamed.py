@@ -1,8 +1,8 @@
-"""Names that were others once: fields of ours, whose old runs still load; what tasks import; what legged_gym calls differently."""
+"""Old names: modules that moved, and tensors that legged_gym calls differently."""
 
 from __future__ import annotations
 
-# A module that a task or a run's config may name, or a class of one -> the module where it is now.
+# A module, or a class, that a task or an old run's config may name -> its module now.
 MOVED: dict[str, str] = {
     "legged_mw.rl.distillation": "legged_mw.rl.students.distillation",
     "RobotTaskCfgPPO": "legged_mw.rl.learner_config",
@@ -15,7 +15,7 @@ MOVED: dict[str, str] = {
     "legged_mw.envs.skill_config": "legged_mw.skills.skill_config",
 }
 
-# What a class ported from legged_gym may read, which is not here -> what is. docs/from_legged_gym.md
+# A tensor that a class ported from legged_gym may read -> its name here. docs/from_legged_gym.md
 LEGGED_GYM_TENSORS: dict[str, str] = {
     "root_states": "root_pos, root_quat (w, x, y, z), root_lin_vel, base_ang_vel",
     "base_quat": "root_quat (w, x, y, z)",

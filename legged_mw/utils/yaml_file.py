@@ -1,7 +1,7 @@
 """YAML in and out: reads configs, contracts and scripts, those of strangers too; writes configs.
 
-It reads plain data alone: mappings with names as keys, lists, text, numbers, true, false, null. Everything else in a file is one
-ConfigError with file and line.
+It reads plain data alone: mappings with names as keys, lists, text, numbers, true, false, null. Everything else in a
+file is one ConfigError with file and line.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class _Loader(yaml.SafeLoader):
         super().__init__(stream)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Count while reading. An alias counts as much as what it stands for: a few lines of them could fill the memory."""
+        """Count the values. An alias counts as many as it stands for: a few lines of aliases could fill the memory."""
         event, before = self.peek_event(), self._nodes
         self._depth += 1
         if self._depth > MOST_DEPTH:

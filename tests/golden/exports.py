@@ -21,7 +21,7 @@ from legged_mw.rl import export as exporting
 from legged_mw.rl.export import export
 from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.keeping import RunLock
-from legged_mw.rl.runs import update_from_run
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import begin_with
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml
