@@ -236,7 +236,7 @@ def _check_regular(path: str, where: str) -> None:
     except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as error:
-        raise ValueError(f"{where}{path[:200]} can be no file: {error.strerror}") from None
+        raise ValueError(f"{where}{os.path.basename(path)[:60]} can be no file: {error.strerror}") from None
     if not regular:
         raise ValueError(f"{where}{path} is no file")
 
