@@ -20,6 +20,7 @@ from legged_mw.eval.exams import require_exam
 from legged_mw.eval.rules import in_common
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE, checkpoints, task_of
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.cli import pick_device, seed_everything
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the results as JSON")
     args = parser.parse_args()
     device, task = pick_device(args.device), load_task(name := args.task or task_of(args.run))
-    task.update_from_run(load_yaml(args.run / CONFIG_FILE), where=str(args.run))
+    update_from_run(task, load_yaml(args.run / CONFIG_FILE), where=str(args.run))
     if args.ranges == "common":
         task.update({"exam": in_common(load_task(name).cfg.exam.peer)}, where="--ranges common")
     require_exam(task)

@@ -25,6 +25,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.cli import apply_overrides, make_parser, pick_device, seed_everything
@@ -106,7 +107,7 @@ def run(args: argparse.Namespace, device: str, worlds: int | None, algorithm: st
     """Measure the task as the flags say, perhaps with another algorithm, and print a line."""
     task = load_task(args.task)
     if device == "cpu":
-        task.fit_cpu(usable_cores())  # as train.py does
+        fit_cpu(task, usable_cores())  # as train.py does
     apply_overrides(task, args)
     if worlds is not None:
         task.cfg.env.num_envs = worlds

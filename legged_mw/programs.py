@@ -19,7 +19,7 @@ from legged_mw.utils.cli import FEWER_WORLDS, fail, one_line_errors
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.machine import settle
 from legged_mw.utils.opaque import fast
-from legged_mw.utils.task import LoadedTask, list_tasks, load_task
+from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 if TYPE_CHECKING:
     from legged_mw.eval.grading import Graded
@@ -39,7 +39,7 @@ def train() -> None:
     args = flags.parse(train.__doc__)
     start_quickly("cpu" if args.list else args.device)
     if args.list:
-        print(list_tasks())
+        print("\n".join(f"{name:<16} {load_task(name).about}" for name in task_names()))
         return
     from legged_mw.check.own_class import check_class
     from legged_mw.eval.exams import find_exam

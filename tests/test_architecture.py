@@ -65,10 +65,13 @@ ONLY_IN = {
         ),
         "legged_mw/tools/*",
         "legged_mw/programs.py",
+        "examples/udp_robot.py",
     ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/fast/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
+    # the reader of strangers' XML: an export's scene is one, and deploy runs without torch
+    "legged_mw.robot.mjcf": ["legged_mw/robot/*", "legged_mw/deploy/*", "legged_mw/rl/export*.py"],
     "legged_mw.drawing": [
         "legged_mw/drawing/*",
         "legged_mw/view/env_stage.py",
@@ -148,7 +151,7 @@ DEPLOY_MAY = [
         "legged_mw.utils.machine",
         "legged_mw.utils.commands",
     ),
-    *("legged_mw.utils.motor_network", "legged_mw.utils.files", "legged_mw.skills.clip", "legged_mw.utils.mjcf"),
+    *("legged_mw.utils.motor_network", "legged_mw.utils.files", "legged_mw.skills.clip", "legged_mw.robot.mjcf"),
     *sys.stdlib_module_names,
 ]
 

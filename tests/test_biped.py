@@ -26,6 +26,7 @@ from legged_mw.envs.feet import GaitClock
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import ExportError, export
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import load_task
 
@@ -478,7 +479,7 @@ def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch
     )
     text = "^legged_mw.deploy would act otherwise than the environment: observation row 'gait_clock' "
     trained = load_task(str(ROOT / BIPED))
-    trained.update_from_run(load_yaml(exported / "out/config.yaml"), where="config.yaml")
+    update_from_run(trained, load_yaml(exported / "out/config.yaml"), where="config.yaml")
     with pytest.raises(ExportError, match=text):
         export(trained, exported / "model.pt", exported / "late")
 

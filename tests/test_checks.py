@@ -16,13 +16,13 @@ from program import SMALL, run
 from worlds import make_env
 
 from legged_mw import ROOT
-from legged_mw.check.own_class import PAYS, WITHOUT, check_class
+from legged_mw.check.own_class import LEGGED_GYM_METHODS, PAYS, WITHOUT, check_class
 from legged_mw.rl.health import Health
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
 from legged_mw.utils.errors import ModelError, StepError, in_short
-from legged_mw.utils.renamed import LEGGED_GYM_METHODS, LEGGED_GYM_TENSORS
+from legged_mw.utils.renamed import LEGGED_GYM_TENSORS
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 
@@ -324,6 +324,8 @@ def test_what_legged_gym_calls_differently_stands_in_the_table() -> None:
     """And what is named instead is there."""
     page = (ROOT / "docs" / "from_legged_gym.md").read_text()
     for old, here in {**LEGGED_GYM_METHODS, **LEGGED_GYM_TENSORS}.items():
+        if old == "anneal":  # a former name of ours
+            continue
         assert re.search(rf"\b{old}\b", page), old
         assert all(word in page for word in re.findall(r"\w+", here.partition("(")[0]) if "_" in word), here
 

@@ -18,6 +18,7 @@ from program import SMALL, Result, files, refused, run, trained
 
 from legged_mw import ROOT
 from legged_mw.rl.export import FILES
+from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.utils.cli import FEWER_WORLDS, duration, one_line_errors
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
@@ -271,7 +272,7 @@ def test_a_cpu_takes_its_own_section_and_what_the_user_says_wins(tmp_path: Path)
 def test_worlds_grow_with_the_cores_up_to_the_tasks_own_number() -> None:
     for cores, worlds in ((1, 256), (8, 2048), (64, 8192)):
         task = load_task("go1_flat")
-        task.fit_cpu(cores)
+        fit_cpu(task, cores)
         assert task.cfg.env.num_envs == worlds
 
 

@@ -17,9 +17,10 @@ from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
 from legged_mw.rl.classes import check_classes
+from legged_mw.rl.learner_config import fit_cpu
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
-from legged_mw.utils.renamed import RENAMED
 from legged_mw.utils.task import LoadedTask, Task, load_task
 
 
@@ -652,9 +653,9 @@ def test_a_run_older_than_a_section_keeps_what_was_so_then() -> None:
     saved = task.to_dict()
     del saved["symmetry"], saved["anneal"]
     assert task.train.symmetry.use_data_augmentation and task.train.anneal.desired_kl
-    assert task.update_from_run(saved, where="config.yaml") == ["anneal", "symmetry"]
+    assert update_from_run(task, saved, where="config.yaml") == ["anneal", "symmetry"]
     assert not task.train.symmetry.use_data_augmentation and task.train.anneal.desired_kl == 0.0
-    assert load_task("go1_flat").update_from_run(load_task("go1_flat").to_dict(), where="config.yaml") == []
+    assert update_from_run(load_task("go1_flat"), load_task("go1_flat").to_dict(), where="config.yaml") == []
 
 
 # ---- names of former releases
@@ -668,7 +669,7 @@ def test_an_old_runs_config_loads_under_the_new_names() -> None:
     del saved["cpu"]["overrides"]
     saved["perturbation"]["enable"] = not saved["perturbation"].pop("kick")
     before = copy.deepcopy(saved)
-    assert task.update_from_run(saved, where="config.yaml") == []
+    assert update_from_run(task, saved, where="config.yaml") == []
     assert task.train.cpu.overrides == {"commands.keep_probability": [0.1, 0.2, 0.3], "perturbation.curriculum": False}
     assert task.cfg.perturbation.kick == saved["perturbation"]["enable"] != load_task("go1_flat").cfg.perturbation.kick
     assert saved == before  # the caller's own
@@ -678,7 +679,7 @@ def test_every_shipped_policys_config_loads() -> None:
     """They are older than some fields; what they say of the fields that they have is kept."""
     for folder in sorted((ROOT / "resources/policies").iterdir()):
         task, saved = load_task(folder.name), load_yaml(folder / "config.yaml")
-        task.update_from_run(saved, where="config.yaml")
+        update_from_run(task, saved, where="config.yaml")
         now = task.to_dict()["rewards"]
         assert now == {**now, **saved["rewards"], "scales": {**now["scales"], **saved["rewards"]["scales"]}}
         check_classes(task.train)
@@ -691,7 +692,7 @@ def test_a_class_of_an_old_run_is_found_where_it_moved_to(old: str) -> None:
     task = load_task("go1_flat")
     saved = task.to_dict()
     saved["distillation"]["class_name"] = old
-    task.update_from_run(saved, where="config.yaml")
+    update_from_run(task, saved, where="config.yaml")
     check_classes(task.train)
     assert resolve_callable(task.train.distillation.class_name) is GraphedDistillation
 
@@ -699,7 +700,7 @@ def test_a_class_of_an_old_run_is_found_where_it_moved_to(old: str) -> None:
 def test_a_wrong_section_of_an_old_run_is_named() -> None:
     saved = {**load_task("go1_flat").to_dict(), "cpu": {"kick_curriculum": False, "overrides": 3}}
     with says("config.yaml: cpu.overrides"):
-        load_task("go1_flat").update_from_run(saved, where="config.yaml")
+        update_from_run(load_task("go1_flat"), saved, where="config.yaml")
 
 
 @pytest.mark.parametrize("separator", [":", "."])
@@ -707,30 +708,8 @@ def test_an_old_run_names_a_class_by_its_old_module(separator: str) -> None:
     task = load_task("go1_flat")
     saved = task.to_dict()
     saved["distillation"]["class_name"] = f"legged_mw.rl.distillation{separator}GraphedDistillation"
-    task.update_from_run(saved, where="config.yaml")
+    update_from_run(task, saved, where="config.yaml")
     assert task.train.distillation.class_name == f"legged_mw.rl.students.distillation{separator}GraphedDistillation"
-
-
-OLD_NAMES = {
-    "perturbation.enable": (True, "perturbation.kick"),
-    "cpu.keep_probability": ([0.5, 0.5, 0.5], "cpu.overrides['commands.keep_probability']"),
-    "cpu.kick_curriculum": (False, "cpu.overrides['perturbation.curriculum']"),
-}
-
-
-@pytest.mark.parametrize("old", OLD_NAMES)
-def test_an_old_name_gets_the_new_one(old: str) -> None:
-    (section, name), (value, new) = old.split("."), OLD_NAMES[old]
-    assert set(OLD_NAMES) == set(RENAMED)
-    with says(f"--set: {old}", new):
-        load_task("go1_flat").set(old, str(value))
-    with says(f"mine.yaml: {old}", new):
-        load_task("go1_flat").update({section: {name: value}}, where="mine.yaml")
-    task = load_task("go1_flat")
-    parent = type(task.train) if section in task.train.to_dict() else type(task.cfg)
-    body = type(section, (getattr(parent, section),), {name: value, "__qualname__": f"Dog.{section}"})
-    with says(f"Dog.{old}", new):
-        type("Dog", (parent,), {section: body, "__qualname__": "Dog"})
 
 
 # ---- what a CPU takes instead
@@ -743,7 +722,7 @@ def test_a_cpus_overrides_name_fields_of_either_config() -> None:
         "algorithm.gamma": 0.5,
         "terrain.mesh_type": "heightfield",
     }
-    task.fit_cpu(cores=1)
+    fit_cpu(task, cores=1)
     assert task.cfg.commands.resampling_time == 3.0 and task.train.algorithm.gamma == 0.5
     assert task.cfg.terrain.mesh_type == "heightfield" and task.cfg.commands.keep_probability == [0.9, 0.25, 0.5]
 
@@ -754,8 +733,8 @@ def test_a_cpus_overrides_name_fields_of_either_config() -> None:
 def test_on_a_cpu_rewards_stay_those_of_a_task_that_subclasses_another(name: str) -> None:
     task, first = load_task(name), load_task("go1_flat")
     rewards = (task.cfg.to_dict()["rewards"], first.cfg.to_dict()["rewards"])
-    task.fit_cpu(cores=1)
-    first.fit_cpu(cores=1)
+    fit_cpu(task, cores=1)
+    fit_cpu(first, cores=1)
     assert task.cfg.to_dict()["rewards"] == rewards[0] and first.cfg.to_dict()["rewards"] != rewards[1]
 
 

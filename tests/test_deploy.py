@@ -34,6 +34,7 @@ from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import exam, rules
 from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.files import digest
@@ -440,7 +441,7 @@ def test_a_wrong_command_line(args: tuple[str, ...], said: str, capsys: pytest.C
 def test_walks_as_in_the_environment(contract: Contract) -> None:
     """Observations agree to float32's rounding at first; then errors grow, as they do in a walk, but the walk is the same."""
     task = load_task("go1_flat")
-    task.update_from_run(load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
+    update_from_run(task, load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
     exam.prepare(task)
     commands = np.array(rules.ExamRules.from_config(task.cfg).commands())
     task.cfg.env.num_envs = len(commands)

@@ -21,11 +21,11 @@ from legged_mw.deploy.seal import sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.rl.export_scene import among_steps
+from legged_mw.robot.mjcf import MOST_BYTES, Source, write_archive
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
-from legged_mw.utils.mjcf import MOST_BYTES, Source, write_archive
 
 SHIPPED = ROOT / "resources/policies/go1_rough_scan"
 

@@ -30,6 +30,7 @@ from legged_mw.rl.classes import actor_settings, network_section
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
@@ -39,7 +40,7 @@ TASK = ["--task", "go1_flat", "--device", "cpu"]
 
 def arguments(made: Path) -> tuple[LoadedTask, Path]:
     task = load_task("go1_flat")
-    task.update_from_run(load_yaml(made / "config.yaml"), "config.yaml")
+    update_from_run(task, load_yaml(made / "config.yaml"), "config.yaml")
     return task, made / "policy.onnx"
 
 

@@ -25,6 +25,7 @@ from legged_mw.eval.exam import OVERRIDES
 from legged_mw.eval.rollout import holding, roll_out
 from legged_mw.rl import export_replay
 from legged_mw.rl.export import ExportError, export
+from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
@@ -184,7 +185,7 @@ def test_a_memory_is_advised_to_learn_slowly_on_a_gpu(settings: dict[str, Any], 
 
 def test_a_cpu_gets_a_smaller_memory() -> None:
     task = load_task("go1_flat")
-    task.fit_cpu(2)
+    fit_cpu(task, 2)
     assert task.train.actor.rnn_hidden_dim == task.train.critic.rnn_hidden_dim == 64
 
 

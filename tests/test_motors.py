@@ -172,7 +172,7 @@ def test_delays_are_rounded_to_the_nearest_simulation_step_a_half_up() -> None:
 
 def test_check_tells_what_a_delay_is_rounded_to() -> None:
     env = make_env(2, {**DC, "domain_rand.enable": True, "domain_rand.delay_ms": [3.0, 7.0]})
-    said = "motors: dc_motor; what they are told takes 4 to 8 ms: domain_rand.delay_ms [3, 7] to the nearest simulation step, of 4 ms"
+    said = "motors: dc_motor, delayed by 4 to 8 ms: domain_rand.delay_ms [3, 7] to the nearest simulation step, of 4 ms"
     assert said in describe(env, load_task("go1_flat"))
 
 

@@ -13,6 +13,7 @@ from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
 from legged_mw.rl.runs import task_of
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.files import find_file
@@ -177,7 +178,7 @@ def test_runs_of_before_name_absolute_files(tmp_path: Path) -> None:
         task = load_task(str(file))
         saved: dict[str, Any] = task.to_dict()
         saved["asset"]["file"], saved["task"] = str(stored), "/far/away/dog.py"
-        task.update_from_run(saved, "config.yaml")
+        update_from_run(task, saved, "config.yaml")
         return task.cfg.asset.file
 
     assert loaded(file.parent / "robot/dog.xml") == loaded(Path("/far/away/dog.xml")) == "robot/dog.xml"

@@ -22,6 +22,7 @@ from legged_mw.rl import policies
 from legged_mw.rl.export import Exported, export
 from legged_mw.rl.network import run_onnx, save_onnx
 from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -31,7 +32,7 @@ OBS = torch.randn(500, 48, generator=torch.Generator().manual_seed(0)) * 2.0
 
 def task_of(folder: Path) -> LoadedTask:
     task = load_task("go1_flat")
-    task.update_from_run(load_yaml(folder / "config.yaml"), "config.yaml")
+    update_from_run(task, load_yaml(folder / "config.yaml"), "config.yaml")
     return task
 
 

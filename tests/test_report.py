@@ -23,6 +23,7 @@ from legged_mw.eval.rollout import Case, Push, roll_out
 from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.eval.trials import make_plan
 from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -32,7 +33,7 @@ GO1 = ExamRules.from_config(load_task("go1_flat").cfg)
 
 def shipped() -> LoadedTask:
     task = load_task("go1_flat")
-    task.update_from_run(load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
+    update_from_run(task, load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
     return task
 
 

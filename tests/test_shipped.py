@@ -23,6 +23,7 @@ from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES
 from legged_mw.rl.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.files import digest
 from legged_mw.utils.task import LoadedTask, load_task
@@ -38,7 +39,7 @@ def test_there_are_some() -> None:
 
 def trained(folder: Path) -> LoadedTask:
     task = load_task(folder.name)
-    task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
+    update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
     return task
 
 
@@ -91,7 +92,7 @@ def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
 def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tmp_path: Path) -> None:
     """Of g1_flat, whose policy asks its ankles for more than their range in every step; the scene is not there."""
     folder, task = ROOT / "resources/policies/g1_flat", load_task("g1_flat")
-    task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
+    update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
     exam.prepare(task)
     task.cfg.env.num_envs = 2
     env, stage = task.env_class(task.cfg, "cpu"), DeployStage(folder, 2)

@@ -19,6 +19,7 @@ from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners
@@ -486,7 +487,7 @@ def test_stock_ppo_learns_with_it(symmetry: dict[str, Any], tmp_path: Path) -> N
     task = small_task(**symmetry)
     save_yaml(tmp_path / "config.yaml", task.to_dict())
     again = load_task("go1_flat")
-    again.update_from_run(load_yaml(tmp_path / "config.yaml"), where="config.yaml")
+    update_from_run(again, load_yaml(tmp_path / "config.yaml"), where="config.yaml")
     assert again.train.to_dict() == task.train.to_dict()
     assert again.train.to_dict()["symmetry"] == {
         **{"use_data_augmentation": False, "use_mirror_loss": False, "mirror_loss_coeff": 0.0},

@@ -23,6 +23,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.policies import Source, Trained, find_trained, load_policy
 from legged_mw.rl.runner import make_runner
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
     TEACHER,
     attach_teacher_observations,
@@ -209,7 +210,7 @@ def test_a_warm_up_goes_on_when_it_is_resumed(tuned: Path, tmp_path: Path) -> No
 def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: LeggedRobot) -> None:
     """A checkpoint of the last iteration of the warm-up: what follows begins at the lowest learning rate, as it would have."""
     task = load_task("go1_rough_student")
-    task.update_from_run(load_yaml(tuned / "config.yaml"), where="config.yaml")
+    update_from_run(task, load_yaml(tuned / "config.yaml"), where="config.yaml")
     task.set("env.num_envs", 16)
     runner = make_runner(task.env_class(task.cfg, "cpu"), task.train, None, "cpu")
     runner.load(str(tuned / "model_1.pt"))
@@ -240,7 +241,7 @@ def test_a_resumed_student_finds_a_teacher_of_any_name(name: str, kept: str, tea
 def test_an_exported_actor_has_a_normalizer_that_has_seen_much(student: Path) -> None:
     """The file holds no count and no variance: an update must not forget the mean that it holds."""
     task = load_task("go1_rough_student")
-    task.update_from_run(load_yaml(student / "config.yaml"), where="config.yaml")
+    update_from_run(task, load_yaml(student / "config.yaml"), where="config.yaml")
     task.set("env.num_envs", 2)
     task.set("terrain.mesh_type", "plane")
     env = task.env_class(task.cfg, "cpu")

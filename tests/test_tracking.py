@@ -19,10 +19,9 @@ from legged_mw.eval.tracking import TrackingExam
 from legged_mw.rl.export import export
 from legged_mw.skills.clip import Clip, read_clip, save_clip
 from legged_mw.skills.motion_reference import angle_between
-from legged_mw.skills.motion_tracking import MotionTracking
+from legged_mw.skills.motion_tracking import MotionTracking, quat_multiply, rotation_quat
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.math import quat_multiply, rotation_quat
 from legged_mw.utils.task import load_task
 
 EXACT = {

@@ -1,1 +1,1 @@
-"""Looks at a task before it is trained: whether its step can be recorded, and what it is made of."""
+"""Check a task before a training: whether its step can be recorded; and describe it."""

@@ -1,4 +1,4 @@
-"""A task in words: what ``train.py --check`` prints."""
+"""The text about a task that ``train.py --check`` prints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from legged_mw.utils.task import LoadedTask
 
 
 def describe(env: RobotTask, task: LoadedTask) -> str:
-    """Observation rows, reward terms, joints, what the config changed in the model and what was overridden, as text."""
+    """Observation rows, reward terms, joints, changes to the model and overridden fields, as text."""
     lines: list[str] = []
     for group, rows in env.observations.groups.items():
         lines.append(f"observation {group} ({sum(row.size for row in rows)})")
@@ -52,13 +52,13 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
 
 
 def _own_terms(env: RobotTask) -> list[str]:
-    """Reward terms that the user's classes write."""
+    """Reward terms of the user's classes."""
     own = own_classes(type(env))
     return sorted({name.removeprefix("_reward_") for kind in own for name in vars(kind) if name.startswith("_reward_")})
 
 
 def _memories(task: LoadedTask) -> list[str]:
-    """The networks that remember."""
+    """A line for each recurrent network."""
     networks = {"actor": task.train.actor, "critic": task.train.critic}
     return [
         f"the {name} remembers: {part.rnn_type}, {part.rnn_hidden_dim} units, layers: {part.rnn_num_layers}"
@@ -68,19 +68,19 @@ def _memories(task: LoadedTask) -> list[str]:
 
 
 def _motors(env: RobotTask) -> str:
-    """Their law, and the delays that a world may have."""
+    """The law of the motors, and the range of their delays."""
     text = f"motors: {env.actuators.law}"
     if "delay_ms" not in env.domain_rand.values:
         return text
     span, step = env.cfg.domain_rand.delay_ms, 1e3 * env.cfg.sim.dt
     low, high = (round_delay(end, step) for end in span)
-    asked = ", ".join(f"{end:g}" for end in span)
-    rounded = f"domain_rand.delay_ms [{asked}] to the nearest simulation step, of {step:g} ms"
-    return f"{text}; what they are told takes {low:g} to {high:g} ms: {rounded}"
+    given = ", ".join(f"{end:g}" for end in span)
+    rounded = f"domain_rand.delay_ms [{given}] to the nearest simulation step, of {step:g} ms"
+    return f"{text}, delayed by {low:g} to {high:g} ms: {rounded}"
 
 
 def _randomized(env: RobotTask) -> str:
-    """What differs between worlds' models, delays and encoders, or that nothing does."""
+    """The ranges of domain randomization, or that there are none."""
     if not env.cfg.domain_rand.enable:
         return "domain_rand.enable is False: none of its ranges is drawn"
     spans = (f"{name} [{low:g}, {high:g}]" for name, (_, low, high) in active(env.cfg, env.motor_law).items())
@@ -88,12 +88,10 @@ def _randomized(env: RobotTask) -> str:
 
 
 def _room(env: RobotTask) -> str:
-    """What mujoco-warp allocates a world, and where the numbers come from."""
+    """The contacts and constraints for which mujoco-warp has room in a world, and the source of these numbers."""
     room, sim = count_capacity(env.robot.physics, env.terrain is not None), env.cfg.sim
-    asked, counted = (sim.nconmax or room.contacts, sim.njmax or room.rows), (room.contacts, room.rows)
-    source = (
-        f"the model: {room.why}"
-        if asked == counted
-        else f"the config; the model makes {counted[0]} and {counted[1]}: {room.why}"
-    )
-    return f"room of a world on mujoco_warp: sim.nconmax {asked[0]}, sim.njmax {asked[1]}, from {source}"
+    taken, counted = (sim.nconmax or room.contacts, sim.njmax or room.rows), (room.contacts, room.rows)
+    source = f"the model: {room.why}"
+    if taken != counted:
+        source = f"the config; the model makes {counted[0]} and {counted[1]}: {room.why}"
+    return f"room of a world on mujoco_warp: sim.nconmax {taken[0]}, sim.njmax {taken[1]}, from {source}"

@@ -1,8 +1,8 @@
-"""Checks a task before it is trained: on a CPU, in a second, that its step can be recorded; the line that breaks a law is named.
+"""Check in a second on a CPU, before a training, that a task's step can be recorded; name the line that breaks a law.
 
-A recorded step is replayed as it was. It may not ask the host for a value, copy from it, or have a shape that depends on
-data (``check/recordable.py``). Every tensor stays where it was, Python numbers stay what they were, also between steps where a
-training changes what the step reads, nothing draws from Python's or numpy's random numbers, and rewards only read.
+A recorded step is replayed without change. So it may not read a value to the host, copy from the host, or have a shape
+that depends on data (``check/recordable.py``). No tensor may move and no Python number may change, in a step and in the
+calls that a training makes between steps. The step may not use Python's or numpy's random numbers; rewards only read.
 """
 
 from __future__ import annotations
@@ -42,17 +42,18 @@ from legged_mw.utils.task import LoadedTask
 
 _WORLDS, _STEPS = 4, 3
 
-_DRAWN = "draws Python's or numpy's random numbers, but a replay repeats what was recorded; write torch.rand(..., device=self.device)"
+_DRAWN = "draws Python's or numpy's random numbers, but a replay repeats what was recorded"
+_DRAWN += "; write torch.rand(..., device=self.device)"
 
-Path = tuple[str | int, ...]  # attributes, keys and places that lead from the environment to what it holds
+Path = tuple[str | int, ...]  # attributes, keys and indices from the environment to one of its values
 
 
 def check_recordable(task: LoadedTask) -> str:
-    """Run a few steps of a tiny environment of ``task`` on the CPU under the guard; takes less than a second.
+    """Run a few steps of a tiny environment of ``task`` on the CPU under the guard, in less than a second.
 
-    Raises StepError, one line with the user's file, line and method: for what a CUDA graph cannot record (NotRecordable), and
-    for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called. Returns what
-    the step writes and a resumed run would not have, in words; ''.
+    Raises NotRecordable for an operation that a CUDA graph cannot record, and StepError for a method that raises, or
+    returns NaN or the wrong shape: one line with the user's file, line and method. Random states are restored. Returns
+    in words the first value that the step writes and that a resumed run would lack; '' if there is none.
     """
     guard = Guard()
     for kind in own_classes(task.env_class):
@@ -64,7 +65,7 @@ def check_recordable(task: LoadedTask) -> str:
     with nothing_changed(), Births(guard):
         try:
             env = _watched(task.env_class, guard)(tiny_cfg(task.cfg), "cpu", True)
-            for name in ("step", "reset", "refresh"):  # the engine of a CPU may ask the host
+            for name in ("step", "reset", "refresh"):  # the CPU's engine may use the host
                 if method := getattr(env.sim, name, None):
                     setattr(env.sim, name, _unwatched(method, guard))
             _check_rows(env)
@@ -80,15 +81,14 @@ def check_recordable(task: LoadedTask) -> str:
             own = [] if users else _own_methods(task.env_class)
             if not users and not own:
                 raise
-            doubt = (
-                f" ({'this does' if len(own) == 1 else 'one of these does'} not fit: {'; '.join(own)})" if own else ""
-            )
-            what = in_short(error) + doubt
+            what = in_short(error)
+            if own:
+                what += f" ({'this does' if len(own) == 1 else 'one of these does'} not fit: {'; '.join(own)})"
             raise StepError(what, f"{task.name}: {where}".removesuffix(": ")) from error
 
 
 def not_remembered(task: LoadedTask) -> str:
-    """What ``check_recordable`` returns, of a step that is not recorded and may break its laws."""
+    """As ``check_recordable`` returns it, for a step that is not recorded and so may break the laws."""
     with nothing_changed():
         env = task.env_class(tiny_cfg(task.cfg), "cpu", True)
         lost = Lost(env)
@@ -111,7 +111,7 @@ def tiny_cfg(cfg: RobotTaskCfg) -> RobotTaskCfg:
 
 
 def _own_methods(env_class: type) -> list[str]:
-    """What the user's classes have in the place of ours, each with its line: where our code fails, one of these is not what it expects."""
+    """What the user's classes override, each with its line. If our code fails, one of these may be the cause."""
     found = []
     for kind in own_classes(env_class):
         names = [name for name in vars(kind) if name == "__init__" or not name.startswith(("__", "_abc"))]
@@ -127,12 +127,12 @@ def _own_methods(env_class: type) -> list[str]:
 
 
 def _of_file(kind: type) -> dict[str, Any]:
-    """What the file of a class holds beside it."""
+    """All names in the file of a class."""
     return vars(sys.modules[kind.__module__]) if kind.__module__ in sys.modules else {}
 
 
 def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
-    """The same class, whose rewards are looked at: they only read, and return finite numbers (N,). Torques of its own law are finite."""
+    """The class with checks: its rewards only read and return finite numbers (N,); its own torques are finite."""
 
     def look(self: RobotTask, value: Tensor, method: Callable[..., Any]) -> None:
         watched = guard.on
@@ -156,7 +156,7 @@ def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
         @functools.wraps(method)
         def law(self: RobotTask, actions: Tensor) -> Any:
             value = method(self, actions)
-            if isinstance(value, Tensor) and value.shape == actions.shape:  # else the motors say so
+            if isinstance(value, Tensor) and value.shape == actions.shape:  # else the motors raise
                 look(self, value, method)
             return value
 
@@ -172,7 +172,7 @@ def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
 
 
 def _unwatched(method: Callable[..., Any], guard: Guard, on: bool = False) -> Callable[..., Any]:
-    """``method``, not watched; what it calls back is, as before: a motor law in code is called by the engine's step."""
+    """``method`` without the guard; its callbacks keep it: the engine's step calls back a motor law in Python."""
 
     def call(*args: Any) -> Any:
         back = [_unwatched(arg, guard, guard.on) if callable(arg) else arg for arg in args]
@@ -183,7 +183,7 @@ def _unwatched(method: Callable[..., Any], guard: Guard, on: bool = False) -> Ca
 
 
 def _check_written(env: RobotTask, tensor: Tensor) -> None:
-    """Inside a reward, no tensor may be written to that the environment holds."""
+    """Raise NotRecordable if a reward writes to ``tensor`` and the environment holds it."""
     memory = tensor.untyped_storage().data_ptr()
     held = [
         (path, value)
@@ -196,7 +196,7 @@ def _check_written(env: RobotTask, tensor: Tensor) -> None:
 
 
 def _check_rows(env: RobotTask) -> None:
-    """Values of observation rows are buffers: asked again, they are the same."""
+    """Raise NotRecordable if a second call of observation_rows gives other tensors: values of rows must be buffers."""
     tables = env.observation_rows(), env.observation_rows()
     for group in tables[0]:
         for row, again in zip(tables[0][group], tables[1][group], strict=True):
@@ -215,7 +215,7 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
         env.on_training_progress(0.0)
         _step(env)
 
-    # on a GPU the first steps are not recorded: what is made once, may be made there; what __init__ made must stay
+    # On a GPU the first steps are not recorded. So they may make new tensors, but tensors of __init__ must stay.
     _check_kept(env, {path: value for path, value in _held(env) if isinstance(value, Tensor)}, first, alone=True)
     state = env.training_state()
     states = _draws(env)
@@ -226,19 +226,19 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
             raise NotRecordable(_DRAWN, _line_that_changes(step, states, type(env).__name__))
         for group, rows in env.observations.groups.items():
             for row in rows:
-                bad = ~(row.value.float().abs() <= BOUND) & ~env.broken[:, None]  # what the step puts 0 for
+                bad = ~(row.value.float().abs() <= BOUND) & ~env.broken[:, None]  # the step replaces these by 0
                 if not row.group and bool(bad.any()):
                     raise StepError(
                         f"row '{row.name}' of '{group}' is not finite, or beyond {BOUND:g}",
                         place_of(env.observation_rows),
                     )
-    # what a training calls between steps that are recorded by then
+    # A training makes these calls between recorded steps.
     for call in (lambda: env.on_training_progress(0.5), env.domain_rand.redraw, lambda: env.load_training_state(state)):
         _check_kept(env, dict(_held(env)), call)
 
 
 def _step(env: RobotTask, watch: AbstractContextManager[Any] | None = None) -> None:
-    """A step with random actions in which every second episode ends."""
+    """A step with random actions; every second episode ends in it."""
     env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length
     actions = torch.rand(_WORLDS, env.num_actions, device=env.device).mul_(2.0).sub_(1.0)
     with watch or nullcontext():
@@ -246,23 +246,24 @@ def _step(env: RobotTask, watch: AbstractContextManager[Any] | None = None) -> N
 
 
 def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None], alone: bool = False) -> None:
-    """After ``step`` all that was held ``before`` is in its place; and unless it is looked at ``alone``, there is nothing else."""
+    """Raise NotRecordable if ``step`` moves or changes a value held ``before``, or adds one, unless ``alone``."""
     places = {path: _place(value) for path, value in before.items()}
     step()
     after = {path: _place(value) for path, value in _held(env)}
     other = [path for path in (places if alone else places | after) if places.get(path) != after.get(path)]
     if other:
         path, now = other[0], _at(env, other[0])
-        what = f"{_shown(path)} becomes another tensor; make it once, in __init__, and write in place: {_shown(path)}.copy_(...)"
+        name = _shown(path)
+        what = f"{name} becomes another tensor; make it once, in __init__, and write in place: {name}.copy_(...)"
         if isinstance(before.get(path, now), int | float):
-            what = f"{_shown(path)} is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
+            what = f"{name} is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
         for each in reversed(other):
             _put_back(env, each, before)
         raise NotRecordable(what, _line_that_changes(step, lambda: _place(_at(env, path)), type(env).__name__))
 
 
 def _draws(env: RobotTask) -> Callable[[], list[object]]:
-    """What tells the states of Python's and numpy's generators: the global ones, those that ``env`` holds, those of the user's files."""
+    """A function that returns the states of Python's and numpy's generators: global ones, ``env``'s, the user's."""
     files = [value for kind in own_classes(type(env)) for value in _of_file(kind).values()]
     values = [*files, *(value for _, value in _held(env))]
     python = [value for value in values if isinstance(value, random.Random)]
@@ -276,14 +277,14 @@ def _draws(env: RobotTask) -> Callable[[], list[object]]:
 
 
 def _position(state: Mapping[str, Any]) -> object:
-    """Where a generator of numpy's is: looked at after each line, so no more of its 624 numbers than tells."""
+    """The state of a numpy generator, in few of its 624 numbers: it is compared after every line."""
     inner = state["state"]
     return (inner["pos"], *inner["key"][:2]) if "key" in inner else str(state)
 
 
 @contextmanager
 def nothing_changed() -> Iterator[None]:
-    """Random numbers and threads are afterwards as they were; inside torch has one thread."""
+    """Restore random states and the number of threads at the end. Inside, torch has one thread."""
     threads, python, numpy = torch.get_num_threads(), random.getstate(), np.random.get_state()
     torch.set_num_threads(1)
     try:
@@ -295,11 +296,11 @@ def nothing_changed() -> Iterator[None]:
         np.random.set_state(numpy)
 
 
-# ---- what an environment holds, and which line changes it ---------------------------------------------------------------
+# ---- the values of an environment, and the line that changes one ---------------------------------------------------
 
 
 def _held(owner: Any, path: Path = (), seen: set[int] | None = None) -> Iterator[tuple[Path, Any]]:
-    """Tensors, numbers and generators that ``owner`` and its parts hold, also inside containers; of the simulation the tensors alone."""
+    """(path, value) of all tensors, numbers and generators in ``owner`` and its parts; of ``sim`` the tensors alone."""
     seen = set() if seen is None else seen
     for key, value in parts(owner).items():
         if isinstance(value, Tensor) or (
@@ -312,16 +313,17 @@ def _held(owner: Any, path: Path = (), seen: set[int] | None = None) -> Iterator
 
 
 def _is_part(value: Any) -> bool:
-    """Whether it is a container, or an object of a class of legged_mw's or of the user's."""
+    """Whether it is a container, or an object of one of our classes or of the user's."""
     module = type(value).__module__
     file = getattr(sys.modules.get(module), "__file__", None) or "<built in>"
     return isinstance(value, CONTAINERS) or not is_library(module, file)
 
 
 def _place(value: Any) -> object:
-    """What must not change: where a tensor is, what a number is."""
-    # NaN is NaN
-    return (value.data_ptr(), value.shape, value.stride(), value.dtype) if isinstance(value, Tensor) else repr(value)
+    """What must not change: the memory of a tensor, the value of a number."""
+    if isinstance(value, Tensor):
+        return value.data_ptr(), value.shape, value.stride(), value.dtype
+    return repr(value)  # as text NaN equals NaN
 
 
 def _at(owner: Any, path: Path) -> Any:
@@ -344,7 +346,7 @@ def _put_back(owner: Any, path: Path, before: dict[Path, Any]) -> None:
 
 
 def _line_that_changes(step: Callable[[], None], look: Callable[[], object], otherwise: str) -> str:
-    """Make another step; watch line by line for the one, of the user's if it is called from there, that changes what ``look`` returns."""
+    """Make another step, line by line. Return the line that changes the value of ``look``, if possible a user's."""
     place, last, found, own = look(), otherwise, "", sys._getframe()
 
     def users(frame: FrameType) -> FrameType:

@@ -1,7 +1,7 @@
-"""Every tensor that an environment holds, found by a walk over its objects: what a step may write.
+"""Find every tensor that an environment holds, by a walk over its objects: all that a step may write.
 
-The guard asks it what a resumed run would not have, the step compiler what to compare. An exact resume itself reads a list:
-``BaseTask.remembered``.
+The guard finds by it the values that a resumed run would lack, the step compiler the values to compare. An exact resume
+itself reads a list, ``BaseTask.remembered``.
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ _PLAIN = (
 )
 _OTHERS = (*_PLAIN, Config, ModuleType, FunctionType, BuiltinFunctionType, MethodType, Simulation, StepGraph)
 _LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
-_FACTS = ("robot", "terrain", "clips")  # of the task, which no step changes
-_LIST = "_remembered"  # of the task: what is in it is found by its own name
-_MODELS = ("MjModel", "MjSpec")  # nor these
+_FACTS = ("robot", "terrain", "clips")  # attributes of the task that no step changes
+_LIST = "_remembered"  # attribute of the task; its tensors are found under their own names
+_MODELS = ("MjModel", "MjSpec")  # classes that no step changes
 
 
 def everything(env: RobotTask) -> dict[str, Tensor]:
-    """All memory that ``env`` reaches, by name: the simulation's, and whatever else it holds."""
+    """Name -> tensor of all memory that ``env`` reaches, the simulation's included."""
     return {f"sim.{name}": value for name, value in env.sim.memory().items()} | _memory(env)
 
 
 class Lost:
-    """Looks for what the steps of ``env`` write and no resumed run would have; made before them."""
+    """Finds values that the steps of ``env`` write and a resumed run would lack. Make it before these steps."""
 
     def __init__(self, env: RobotTask) -> None:
         self._env, self._before = env, {name: _mark(value) for name, value in _memory(env).items()}
 
     def named(self) -> str:
-        """After the steps: the first such thing, in words; ''."""
+        """Call it after the steps: the first such value, in words; '' if there is none."""
         for name, thing in _reach(self._env, "", set()):
             if not isinstance(thing, Tensor):
                 return f"what self.{name} remembers, a {type(thing).__name__}, is not kept"
@@ -76,14 +76,14 @@ def _mark(value: Tensor) -> tuple[int, Tensor]:
 
 
 def _same(mark: tuple[int, Tensor], before: tuple[int, Tensor] | None) -> bool:
-    """Not written since ``before``, as far as torch and the bits tell."""
+    """Whether the tensor was not written since ``before``, by torch's counter and by its bits."""
     if before is None or mark[0] != before[0] or mark[1].shape != before[1].shape or mark[1].dtype != before[1].dtype:
         return False
     return torch.equal(mark[1].view(torch.uint8), before[1].view(torch.uint8))
 
 
 def _memory(env: RobotTask) -> dict[str, Tensor]:
-    """Name -> a piece of memory that ``env`` reaches, all of it and flat; not the simulation's."""
+    """Name -> a whole storage that ``env`` reaches, flat; without the simulation's."""
     seen = {value.untyped_storage().data_ptr() for value in env.sim.memory().values()}
     found: dict[str, Tensor] = {}
     for name, value in _reach(env, "", set()):
@@ -99,7 +99,7 @@ def _memory(env: RobotTask) -> dict[str, Tensor]:
 def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Any]]:
     """(dotted name, tensor) of all tensors and arrays of numbers that ``thing`` holds.
 
-    In the place of a tensor stands what may remember something and is not looked into.
+    Also (dotted name, object) of objects that may remember something and cannot be searched.
     """
     if isinstance(thing, Tensor):
         yield path, thing
@@ -123,11 +123,11 @@ def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Any]]:
 
 
 def parts(thing: Any) -> dict[Any, Any]:
-    """What ``thing`` holds, by key, place or name: a container, or an object with attributes or slots."""
+    """The parts of a container by key or index, of an object by the names of its attributes and slots."""
     if isinstance(thing, dict | TensorDictBase):
         return dict(thing.items())
     if isinstance(thing, list | tuple | deque):
         return dict(enumerate(thing))
-    state: Any = object.__getstate__(thing)  # attributes; or those, and slots
+    state: Any = object.__getstate__(thing)  # attributes, or (attributes, slots)
     both = state if isinstance(state, tuple) else [state]
     return {name: value for held in both for name, value in (held or {}).items() if name != _LIST}

@@ -1,6 +1,6 @@
-"""Methods of a user's class that do not fit ours: a hook that never calls its parent's, a name of legged_gym's that nothing calls.
+"""Check a user's class: hooks that never call their parent's, methods of legged_gym that nothing calls here.
 
-Also a reward term of ours whose scale has another sign than usual.
+Also the signs of the scales of our reward terms.
 """
 
 from __future__ import annotations
@@ -11,18 +11,32 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from legged_mw.utils.errors import StepError, place_of
-from legged_mw.utils.renamed import LEGGED_GYM_METHODS
 
 HOOKS = (  # every step or reset needs what their parents do; hooks of commands may be replaced
     *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
 )
-WITHOUT = "# without super"  # a comment in the method: it is so on purpose
-# terms of RobotTask and LeggedRobot with a usual scale above 0, as all of a skill's own have; others cost
+WITHOUT = "# without super"  # a comment in a method that does not call its parent's on purpose
+# Terms of RobotTask and LeggedRobot with a usual scale above 0; their other terms cost. A skill's own terms pay.
 PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )
+# What a class ported from legged_gym may define, which nothing here calls -> what is called. docs/from_legged_gym.md
+LEGGED_GYM_METHODS: dict[str, str] = {
+    "post_physics_step": "_step()",
+    "_post_physics_step_callback": "_update_state() and _end_step()",
+    "_get_noise_scale_vec": "observation_rows()",
+    "reset_idx": "reset_envs(mask)",
+    "anneal": "on_training_progress(share)",  # not legged_gym's: ours, before
+    "_reset_dofs": "_reset_robots(mask)",
+    "_reset_root_states": "_reset_robots(mask)",
+    "update_command_curriculum": "_update_command_curriculum(mask)",
+    "_get_heights": "_scan_heights()",
+    "_push_robots": "perturbation.push of the config",
+    **dict.fromkeys(("create_sim", "_create_envs"), "_load_robot()"),
+    **dict.fromkeys(("_process_rigid_shape_props", "_process_dof_props", "_process_rigid_body_props"), "_load_robot()"),
+}
 
 
 def own_classes(env_class: type) -> list[type]:
@@ -31,7 +45,7 @@ def own_classes(env_class: type) -> list[type]:
 
 
 def check_class(env_class: type, scales: Mapping[str, float]) -> list[str]:
-    """Warnings on methods that nothing calls, and on ``scales`` of our terms. Raises StepError at a hook that never calls its parent's."""
+    """Warnings about unused methods and signs of ``scales``. Raises StepError for a hook without super()."""
     for kind, name, method in _own(env_class):
         source = _source(method)
         if name not in HOOKS or re.search(rf"\.{name}\b", source) or WITHOUT in source or not source:
@@ -39,8 +53,8 @@ def check_class(env_class: type, scales: Mapping[str, float]) -> list[str]:
         if _does_something(env_class.__mro__[env_class.__mro__.index(kind) + 1 :], name):
             arguments = ", ".join([*inspect.signature(method).parameters][1:])
             call = f"super().{name}({arguments})"
-            what = f"never calls {call}, which every robot needs: call it first; if it is so on purpose, say {WITHOUT} in a comment there"
-            raise StepError(what, place_of(method))
+            what = f"never calls {call}, which every robot needs: add this call, mostly as the first line"
+            raise StepError(f"{what}; to leave it out on purpose, write the comment {WITHOUT} there", place_of(method))
     lines = []
     for kind, name, method in _own(env_class):
         misspelt = re.fullmatch(r"_?rewards?_\w+", name) and not name.startswith("_reward_")
@@ -56,7 +70,7 @@ def check_class(env_class: type, scales: Mapping[str, float]) -> list[str]:
 
 
 def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str]:
-    """Of terms that are ours."""
+    """Warnings about our own terms with a scale of the unusual sign."""
     for name, scale in scales.items():
         method = getattr(env_class, f"_reward_{name}", None)
         if method is None or not method.__module__.startswith("legged_mw."):
@@ -68,24 +82,24 @@ def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str
 
 
 def _own(env_class: type) -> Iterator[tuple[type, str, Callable[..., Any]]]:
-    """(class, name, method) of all methods that the user's classes write."""
+    """(class, name, method) of all methods in the user's classes."""
     for kind in own_classes(env_class):
         yield from ((kind, name, value) for name, value in vars(kind).items() if inspect.isfunction(value))
 
 
 def _does_something(parents: tuple[type, ...], name: str) -> bool:
-    """Whether what the parents have under ``name`` is more than a docstring."""
+    """Whether the parents' method ``name`` does more than to have a docstring."""
     method = next((vars(kind)[name] for kind in parents if name in vars(kind)), None)
     return method is not None and bool(re.search(r"self\.|return", _source(method)))
 
 
 def _is_called(env_class: type, name: str) -> bool:
-    """Whether another method of the user's names it."""
+    """Whether another method of the user calls ``name``."""
     return any(re.search(rf"\.{name}\b", _source(method)) for _, other, method in _own(env_class) if other != name)
 
 
 def _source(method: Any) -> str:
-    """What is written there; '' of what was typed at a prompt."""
+    """The source of a method; '' if it was typed at a prompt."""
     try:
         return inspect.getsource(inspect.unwrap(method))
     except (OSError, TypeError):

@@ -1,6 +1,6 @@
-"""What a recorded step may not do, caught on a CPU where it is done: ask the host, copy from it, or depend on data for a shape.
+"""Catch on a CPU what a CUDA graph cannot record: reads to the host, copies from it, shapes that depend on data.
 
-On a CPU all tensors are on the same device. So those that the user's code makes without naming one are noted (``Births``).
+On a CPU all tensors are on one device. So ``Births`` notes the tensors that the user's code makes without a device.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch.utils._pytree import tree_leaves
 from legged_mw.utils import math
 from legged_mw.utils.errors import NotRecordable, is_library, line_of
 
-# Seen by name, because on a CPU some of them reach no kernel at all.
+# Found by name, because on a CPU some of them start no kernel.
 _CONDITIONS = {"__bool__", "is_nonzero", "__contains__"}
 _PRINTS = {"__repr__", "__str__", "__format__"}
 _HOST_READS = {
@@ -51,7 +51,7 @@ _FACTORIES = {
     "randperm",
     "normal",
 }
-# Kernels that read a value to the host, or whose result has as many elements as the data say.
+# Kernels that read a value to the host; below, kernels with a result of a size that depends on data.
 _READING = {"_local_scalar_dense", "equal", "allclose", "histc", "bincount", "_linalg_check_errors"}
 _READING |= {"_linalg_eigh", "_linalg_svd", "linalg_eig", "linalg_lstsq"}  # only on a GPU
 _DATA_SHAPED = {
@@ -67,9 +67,9 @@ _INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_ind
 
 
 class Guard:
-    """What is watched at the moment: calls while ``on``, and then ``on_write`` is called with each tensor that is written to.
+    """The state of the watch. While ``on``, forbidden calls raise, and ``on_write`` gets every tensor that is written.
 
-    ``on_host``: address -> a tensor that would be on the host, kept so that its place stays its own; what is wrong with it; where.
+    ``on_host``: address -> (tensor that would be on the host, its fault, its line). The tensor reserves the address.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class Guard:
 
     @contextmanager
     def set(self, **values: Any) -> Iterator[None]:
-        """``on`` or ``on_write`` for a while."""
+        """Set ``on`` or ``on_write`` inside of a with statement."""
         before = {name: getattr(self, name) for name in values}
         vars(self).update(values)
         try:
@@ -89,7 +89,7 @@ class Guard:
 
 
 class Births(TorchFunctionMode):
-    """Notes what the user's code makes without a device, and what is computed from nothing else."""
+    """Notes tensors that the user's code makes without a device, and tensors computed from these alone."""
 
     def __init__(self, guard: Guard) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ class Births(TorchFunctionMode):
         kwargs = kwargs or {}
         result, name = func(*args, **kwargs), getattr(func, "__name__", "")
         given_one = name in _HOST_WRITES and kwargs.get("device") is not None  # as_tensor(x, device=...)
-        if given_one or (name == "to" and _moves(args[1:], kwargs)):  # which is nothing on a CPU
+        if given_one or (name == "to" and _moves(args[1:], kwargs)):  # on a CPU the same tensor
             return result.clone() if _address(result) in self._known else result
         made = [
             value for value in (result if isinstance(result, tuple | list) else [result]) if isinstance(value, Tensor)
@@ -130,7 +130,7 @@ class Births(TorchFunctionMode):
 
 
 class _FunctionGuard(TorchFunctionMode):
-    """What Python calls torch by."""
+    """Checks the calls of torch's Python functions."""
 
     def __init__(self, guard: Guard) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ class _FunctionGuard(TorchFunctionMode):
 
 
 class _DispatchGuard(TorchDispatchMode):
-    """What torch itself runs, however it was called."""
+    """Checks the kernels that torch runs."""
 
     def __init__(self, guard: Guard) -> None:
         super().__init__()
@@ -158,7 +158,7 @@ class _DispatchGuard(TorchDispatchMode):
             raise NotRecordable(found)
         if self.guard.on and self.guard.on_host:
             for value in tree_leaves((args, kwargs)):
-                # a number without dimensions is an argument of a kernel, also on the host; but it is not copied from, nor written
+                # a kernel takes a tensor without dimensions from the host too, except to copy it or to write to it
                 kernel = func.overloadpacket.__name__
                 held = kernel == "copy_" or (kernel.endswith("_") and value is args[0])
                 number = isinstance(value, Tensor) and value.dim() == 0 and not held
@@ -175,13 +175,14 @@ class _DispatchGuard(TorchDispatchMode):
 
 
 def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any]) -> str:
-    """What is wrong with a call, and what to write instead; "" if nothing is."""
+    """The fault of a call, and what to write instead; "" if there is none."""
     name = getattr(func, "__name__", "")
     call = f"{name.strip('_')}()"
     if name in ("__getitem__", "__setitem__") and any(
         map(_is_scalar_index, args[1] if isinstance(args[1], tuple) else args[1:2])
     ):
-        return "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
+        write = "write x.index_select(dim, index.view(1)), or use a Python int"
+        return f"a tensor without dimensions as an index is read to the host; {write}"
     if name in _CONDITIONS:
         return "a tensor as a condition (if, and, not, in) is read to the host; write torch.where(condition, a, b)"
     if name in _PRINTS:
@@ -199,21 +200,23 @@ def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any
 
 
 def _breach_of_kernel(func: Any, args: tuple) -> str:
-    """What is wrong with a kernel, and what to write instead; "" if nothing is."""
+    """The fault of a kernel, and what to write instead; "" if there is none."""
     name, overload = func.overloadpacket.__name__, func._overloadname
     if name in _READING:
         return f"{name.strip('_')} reads a tensor to the host; keep it a tensor and compute with that"
-    # a number assigned through an index is lifted too, without a copy: it has no dimension
+    # a number that is assigned through an index is lifted too, but without a copy
     if name == "lift_fresh" and args[0].dim() > 0:
         return "a list or an array, as data or as an index, copies from the host; make it a tensor once, in __init__"
     if name == "multinomial":
-        return "multinomial reads a tensor to the host; write (weights / torch.empty_like(weights).exponential_()).argmax(dim=1)"
+        write = "write (weights / torch.empty_like(weights).exponential_()).argmax(dim=1)"
+        return f"multinomial reads a tensor to the host; {write}"
     if name in _DATA_SHAPED or (name, overload) == ("repeat_interleave", "Tensor"):
         return f"{name.strip('_')} has a shape that depends on data; keep every row, and write torch.where(mask, a, b)"
     if name == "normal" and overload in ("Tensor_Tensor", "float_Tensor"):
         return "normal reads the sign of a tensor of deviations to the host; write mean + std * torch.randn_like(std)"
     if name in _INDEXED and any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1]):
-        return "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
+        write = "write torch.where(mask, a, b), or assign(x, mask, value)"
+        return f"a mask as an index has a shape that depends on data; {write}"
     return ""
 
 
@@ -222,15 +225,13 @@ def _address(tensor: Tensor) -> int:
 
 
 def _users_line() -> str:
-    """The line of the user's that is running, unless code of legged_mw's does that it calls; ""."""
+    """The running line of the user's code; "" if our code runs, even if the user's called it."""
     frame: FrameType | None = sys._getframe()
     while frame and is_library(frame.f_globals.get("__name__", ""), frame.f_code.co_filename):
         frame = frame.f_back
-    return (
-        ""
-        if not frame or frame.f_globals.get("__name__", "").startswith("legged_mw.")
-        else line_of(frame.f_code, frame.f_lineno)
-    )
+    if not frame or frame.f_globals.get("__name__", "").startswith("legged_mw."):
+        return ""
+    return line_of(frame.f_code, frame.f_lineno)
 
 
 def _is_scalar_index(index: object) -> bool:
@@ -243,7 +244,7 @@ def _is_scalar_index(index: object) -> bool:
 
 
 def _moves(args: tuple, kwargs: dict[str, Any]) -> bool:
-    """Whether arguments of ``Tensor.to`` name a device, not only a dtype; another tensor names its device."""
+    """Whether the arguments of ``Tensor.to`` name a device, itself or by another tensor, and not only a dtype."""
     return any(
         isinstance(value, str | int | torch.device | Tensor) and not isinstance(value, bool)
         for value in [*args, *kwargs.values()]
@@ -252,17 +253,17 @@ def _moves(args: tuple, kwargs: dict[str, Any]) -> bool:
 
 @contextmanager
 def recordable(guard: Guard | None = None) -> Iterator[None]:
-    """Inside, calls that a CUDA graph cannot record raise NotRecordable; what only a CPU asks is not asked."""
+    """Inside, calls that a CUDA graph cannot record raise NotRecordable, and ``maybe_any`` answers as on a GPU."""
     guard = guard or Guard()
-    # getattr would import what is lazy
+    # modules of ours that imported the function; read by __dict__, since getattr would load lazy modules
     held = [(module, getattr(module, "__dict__", {})) for module in list(sys.modules.values())]
-    asks = [module for module, names in held if names.get("maybe_any") is math.maybe_any]
+    users = [module for module, names in held if names.get("maybe_any") is math.maybe_any]
     original = math.maybe_any
     try:
-        for module in asks:
+        for module in users:
             vars(module)["maybe_any"] = lambda mask: True
         with guard.set(on=True), _FunctionGuard(guard), _DispatchGuard(guard):
             yield
     finally:
-        for module in asks:
+        for module in users:
             vars(module)["maybe_any"] = original

@@ -23,8 +23,15 @@ from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError, brief, unknown
 from legged_mw.utils.files import digest, finish_moving
-from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
-from legged_mw.utils.motor_network import Floats, MotorNetwork, read_network
+from legged_mw.utils.motor_network import (
+    DC_CONSTANT,
+    DC_DAMPING,
+    DC_RESISTANCE,
+    DC_STIFFNESS,
+    Floats,
+    MotorNetwork,
+    read_network,
+)
 
 # ---- typed values of a contract -------------------------------------------------------------------------------------
 
@@ -100,7 +107,7 @@ class Reader:
 
 def compile_scene(file: Path) -> Any:
     """The model in an export's scene. Raises ContractError."""
-    from legged_mw.utils.mjcf import Source, check_model  # which bring MuJoCo
+    from legged_mw.robot.mjcf import Source, check_model  # which bring MuJoCo
 
     try:
         model = Source(file, alone=True).spec().compile()

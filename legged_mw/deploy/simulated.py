@@ -37,9 +37,9 @@ from legged_mw.deploy.contract import (
     target_range,
 )
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
+from legged_mw.robot.mjcf import Source, check_model
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
-from legged_mw.utils.mjcf import Source, check_model
 
 # ---- a robot placed by its measurements -----------------------------------------------------------------------------
 

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.bounds import (
+    PAIR,
+    SOME,
     THREE,
     Bound,
     Count,
@@ -16,20 +18,22 @@ from legged_mw.utils.bounds import (
     Height,
     NonNegative,
     NonNegativeInt,
-    Points,
     Positive,
     PositiveShare,
     Range,
     Share,
-    ShareRange,
     Sign,
-    Swing,
+    above,
+    at_least,
     or_empty,
 )
 from legged_mw.utils.commands import HEADING
 from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 
+Points = Annotated[list[Annotated[float, at_least(-100, 100, "m")]], SOME]
+ShareRange = Annotated[list[Share], PAIR]
+Swing = Annotated[float, above(0, 10, "m")]  # height of a foot in its swing
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
 _CELL = Bound("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25)

@@ -13,28 +13,21 @@ from legged_mw.utils.bounds import (
     THREE,
     Angle,
     Bound,
-    ContactTimes,
     Count,
-    Delays,
-    Factors,
-    Frictions,
     Gain,
     Height,
     Names,
     NonNegative,
     NonNegativeInt,
-    Offsets,
-    Places,
     Positive,
     PositiveRange,
     PositiveShare,
     Range,
     Scale,
     Seconds,
-    Shares,
+    Share,
     SmallInt,
     Speed,
-    StepDelays,
     Threads,
     above,
     at_least,
@@ -42,6 +35,16 @@ from legged_mw.utils.bounds import (
 )
 from legged_mw.utils.config import Config, ConfigError
 
+# Ranges to draw from; an empty one draws nothing.
+Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
+_FRICTION = Bound("from 1e-05, as which MuJoCo takes all below it, to 1000", lambda value: 1e-5 <= value <= 1000)
+Frictions = Annotated[list[Annotated[float, _FRICTION]], or_empty(PAIR)]
+Places = Annotated[list[Annotated[float, at_least(-10, 10, "m")]], or_empty(PAIR)]
+ContactTimes = Annotated[list[Annotated[float, at_least(1e-4, 10, "s")]], or_empty(PAIR)]
+Offsets = Annotated[list[float], or_empty(PAIR)]
+Shares = Annotated[list[Share], or_empty(PAIR)]
+Delays = Annotated[list[NonNegative], or_empty(PAIR)]
+StepDelays = Annotated[list[NonNegativeInt], or_empty(PAIR)]
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
 _CAMERA = Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2]))
 Camera = Annotated[list[float], or_empty(_CAMERA)]

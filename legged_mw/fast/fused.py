@@ -20,8 +20,7 @@ from torch import Tensor
 
 from legged_mw.fast.fused_code import ADD_ROWS, Writer
 from legged_mw.fast.fused_memory import HELPERS, TYPES, Access, Code, Unfit
-from legged_mw.fast.trace import Call, Node, Trace
-from legged_mw.utils.math import alike
+from legged_mw.fast.trace import Call, Node, Trace, alike
 
 if wp.config.log_level < wp.LOG_WARNING:  # no engine of warp's steps here, and nobody asks what warp finds and loads
     wp.config.log_level = wp.LOG_ERROR

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.fast.trace import Call, Trace
-from legged_mw.utils.math import alike
+from legged_mw.fast.trace import Call, Trace, alike
 
 _WORTH = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
 _CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison

@@ -50,6 +50,7 @@ from legged_mw.envs.motors import motor_drive
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import Scene, among_steps, standalone
+from legged_mw.rl.keeping import sweep
 from legged_mw.rl.network import (
     ESTIMATE,
     INPUT,
@@ -66,6 +67,7 @@ from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.rl.students.estimator import EstimatingModel, find_targets
 from legged_mw.rl.students.recurrent import states_of
+from legged_mw.robot.mjcf import write_archive
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.servos import CURVE
 from legged_mw.sim.terrain import LEVEL, make_terrain
@@ -73,8 +75,7 @@ from legged_mw.skills.clip import save_clip
 from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
-from legged_mw.utils.files import STAGED, digest, find_file, finish_moving, flush, sweep
-from legged_mw.utils.mjcf import write_archive
+from legged_mw.utils.files import STAGED, digest, find_file, finish_moving
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
@@ -242,8 +243,8 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
         yield new
         for name in (*FILES, *SOMETIMES, *ONCE):
             (new / name).touch()  # empty: one of an earlier export, which would be another policy's
-            flush(new / name)
-        flush(new)
+            _flush(new / name)
+        _flush(new)
         os.replace(new, folder / STAGED)
         finish_moving(folder)
     except OSError as error:
@@ -253,6 +254,15 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
         with suppress(OSError):
             for part in mine:  # those that are empty: nothing was written
                 part.rmdir()
+
+
+def _flush(path: Path) -> None:
+    """Have a file, or a folder's list of files, on the disk itself, where a power cut does not reach it."""
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
 
 
 # ---- the contract --------------------------------------------------------------------------------------------------

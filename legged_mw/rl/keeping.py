@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,6 @@ from legged_mw.rl.resume import suffix_of, worlds_file
 from legged_mw.rl.runs import checkpoints, save_whole
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import shown
-from legged_mw.utils.files import sweep
 
 LOCK_FILE = ".lock"
 
@@ -141,3 +141,25 @@ def reason_of(error: BaseException) -> str:
     if isinstance(first, OSError) and first.strerror:
         return first.strerror
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def sweep(folder: Path) -> None:
+    """Remove what killed programs left half written in ``folder``: ``.NAME.PID.tmp`` of a process that is gone."""
+    for path in folder.glob(".*.tmp"):
+        name = re.fullmatch(r"\.(export|.+\.(?:pt|yaml))\.(\d{1,9})\.tmp", path.name)
+        if not name or _lives(int(name[2])):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True

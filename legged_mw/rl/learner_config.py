@@ -8,23 +8,26 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from legged_mw.utils.bounds import (
+    SOME,
     Bound,
     Count,
-    Iterations,
     NonNegative,
     NonNegativeInt,
     Positive,
     PositiveRange,
     PositiveShare,
-    Seed,
     Share,
-    Sizes,
     SmallInt,
     Threads,
+    at_least,
 )
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.files import MOST_LETTERS, wrong_name
+from legged_mw.utils.task import LoadedTask
 
+Iterations = Annotated[int, at_least(0, 1_000_000)]
+Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
+Sizes = Annotated[list[Count], SOME]  # of layers
 FolderPart = Annotated[
     str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))
 ]
@@ -207,3 +210,17 @@ class LeggedRobotCfgPPO(RobotTaskCfgPPO):
             "commands.keep_probability": [0.7, 0.25, 0.5],  # to turn on the spot is rare otherwise, and learned last
             "perturbation.curriculum": True,  # the strongest kicks keep a beginner from learning to walk
         }
+
+
+def fit_cpu(task: LoadedTask, cores: int) -> None:
+    """Set what the section ``cpu`` of the learner's config says, for ``cores`` cores."""
+    train, few = task.train, task.train.cpu
+    task.cfg.env.num_envs = min(task.cfg.env.num_envs, few.envs_per_core * cores)
+    train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
+    train.algorithm.num_learning_epochs = few.num_learning_epochs
+    train.algorithm.num_mini_batches = few.num_mini_batches
+    train.algorithm.desired_kl = few.desired_kl
+    train.actor.hidden_dims = train.critic.hidden_dims = few.hidden_dims
+    train.actor.rnn_hidden_dim = train.critic.rnn_hidden_dim = few.rnn_hidden_dim
+    for path, value in few.overrides.items():
+        task.set(path, value, where="cpu.overrides")

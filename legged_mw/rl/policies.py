@@ -27,6 +27,7 @@ from legged_mw.rl.runs import (
     runs,
     task_of,
 )
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import printable, shown
 from legged_mw.utils.files import check_folder, finish_moving, typed
@@ -121,7 +122,7 @@ def shipped_policy(task: LoadedTask, asked: str) -> Source:
 def load_trained(name: str, source: Source) -> LoadedTask:
     """The task called ``name`` with the config that the policy was trained with."""
     task, config = load_task(name), source.folder / CONFIG_FILE
-    task.update_from_run(load_yaml(config), where=shown(config))
+    update_from_run(task, load_yaml(config), where=shown(config))
     return task
 
 

@@ -13,10 +13,11 @@ from typing import Any
 import torch
 
 from legged_mw.rl.checkpoint import EARLIER, check_content, damage, sealed
+from legged_mw.rl.saved_config import of_project, somebodys
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown, unknown
 from legged_mw.utils.files import check_folder, check_name, typed
-from legged_mw.utils.task import LoadedTask, of_project, somebodys
+from legged_mw.utils.task import LoadedTask
 
 CONFIG_FILE = "config.yaml"
 

@@ -23,6 +23,7 @@ from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
+from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.rl.memory_check import check_room
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import MAX_RATE
@@ -30,6 +31,7 @@ from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stu
 from legged_mw.rl.recorded import Recorded
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
     TEACHER,
     attach_teacher_observations,
@@ -79,7 +81,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     rank = this_rank()
     device = pick_device(rank_device(rank, args.device))
     if fitted := device == "cpu" and task.train.cpu.enable and not start.run:
-        task.fit_cpu(usable_cores())
+        fit_cpu(task, usable_cores())
         fields = ", ".join(["worlds", "networks", "learner", *task.train.cpu.overrides])
         print(f"on a CPU the section cpu sets {fields}; flags win, --set cpu.enable=false leaves it out")
     if start.policy:
@@ -108,7 +110,7 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     start = Start(experiment, run, checkpoint, goes_on=checkpoint == find_checkpoint(run, -1))
     if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
         _lock(start).release()  # else it is known only after the environment is made
-    for section in task.update_from_run(load_yaml(config), where=shown(config)):
+    for section in update_from_run(task, load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
 

@@ -18,10 +18,10 @@ import mujoco
 
 from legged_mw.robot.draft import Draft, parents, values
 from legged_mw.robot.meshes import path_of
+from legged_mw.robot.mjcf import Source
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.robot_file import naming
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.mjcf import Source
 
 WIDTH = 140  # [columns] of a line of the config
 

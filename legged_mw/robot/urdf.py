@@ -12,8 +12,8 @@ from xml.etree.ElementTree import Element
 import mujoco
 
 from legged_mw.robot.meshes import READABLE, why_unreadable
+from legged_mw.robot.mjcf import Source
 from legged_mw.utils.errors import ModelError
-from legged_mw.utils.mjcf import Source
 
 _KNOWN = ("link", "joint", "material", "mujoco")  # what the reader needs; the rest is for other programs
 _COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "false"}

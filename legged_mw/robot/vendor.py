@@ -16,11 +16,11 @@ import mujoco
 import numpy as np
 
 from legged_mw.robot.meshes import compile_readable
+from legged_mw.robot.mjcf import Source, check_model
 from legged_mw.robot.urdf import read_urdf
 from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, UPRIGHT, Keyframe, RobotFile, kind_of, naming, tilt
 from legged_mw.sim.servos import take_limits
 from legged_mw.utils.errors import ModelError
-from legged_mw.utils.mjcf import Source, check_model
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one

@@ -1,4 +1,4 @@
-"""A robot's file, read. A plain MJCF, as those in ``resources/robots`` are, is read here; ``legged_mw.robot`` reads all others.
+"""Read a robot's file: here a plain MJCF, as those in ``resources/robots`` are; ``legged_mw.robot`` reads all others.
 
 Host only; nothing is stepped.
 """
@@ -13,20 +13,22 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import XML, Element, ParseError, tostring
 
 import mujoco
 import numpy as np
 
 from legged_mw.sim.servos import Range, take_limits
 from legged_mw.utils.errors import ModelError
-from legged_mw.utils.mjcf import Source, check_model
 
-# What a plain MJCF consists of. It has one body, with a free joint, and what else it has nobody needs to mend.
+# What a plain MJCF consists of: one body with a free joint, no other file, numbers that a machine may have.
 _SECTIONS = {"compiler", "option", "default", "asset", "worldbody", "keyframe"}
+_IN_ASSET = {"material", "mesh"}
 _IN_COMPILER = {"angle", "autolimits"}
 _IN_DEFAULT = {"default", "joint"}  # of its main class, which is that of what we add, too
 _IN_BODY = {"body", "freejoint", "joint", "inertial", "geom", "site"}
+_NOT_NEGATIVE = {"mass", "density", "diaginertia", "armature", "frictionloss"}
+_MOST_BYTES, _LARGEST = 1 << 20, 1e5  # of a plain file; of its numbers, in any unit, and of the mass [kg]
 # names of what is added around a robot: by sim.ground, and to be looked at
 SCENE = re.compile(r"(floor|ground|around|relief|sky)(/.*)?")
 
@@ -68,14 +70,14 @@ class RobotFile:
 
 
 def read_plain(file: Path) -> RobotFile | None:
-    """Read a plain MJCF. None: the file is none, and ``legged_mw.robot.vendor`` reads it or says what is wrong."""
-    if not file.is_file():
-        return None
-    with naming(file):
-        source, notes = Source(file), list[str]()
-        if not _is_plain(source):
+    """Read a plain MJCF. None: it is not plain, or wrong; ``legged_mw.robot.vendor`` reads it, or says what is wrong."""
+    try:
+        if not file.is_file() or file.stat().st_size > _MOST_BYTES:
             return None
-        spec, keyframe = source.spec(), None
+        text, notes, keyframe = file.read_text(encoding="utf-8"), list[str](), None
+        if "<!DOCTYPE" in text or not _is_plain(root := XML(text)):
+            return None
+        spec = mujoco.MjSpec.from_string(tostring(root, encoding="unicode"))
         limits, joints = take_limits(spec, notes), list(spec.joints)[1:]
         if not joints or not all(joint.type in SCALAR_JOINTS and joint.name for joint in joints):
             return None
@@ -87,30 +89,45 @@ def read_plain(file: Path) -> RobotFile | None:
             notes.append(f"keyframe '{key.name}' read: pose and height of the root, where nothing else states them")
             spec.delete(key)
         spec.nkey = 0
-        try:
-            with warnings.catch_warnings(record=True) as said:
-                model = compile_copy(spec)
-        except ValueError:
-            return None
-        check_model(model)
-    return None if said else RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
+        with warnings.catch_warnings(record=True) as said:
+            model = compile_copy(spec)
+    except (OSError, ValueError, ParseError, RecursionError):
+        return None
+    if said or not model.body_mass.sum() <= _LARGEST:
+        return None
+    return RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
 
 
-def _is_plain(source: Source) -> bool:
+def _is_plain(root: Element) -> bool:
     """By its elements and attributes alone, before MuJoCo reads it."""
-    root, bodies = source.root, source.root.findall("worldbody/*")
-    if root.tag != "mujoco" or len(bodies) != 1 or not bodies[0].get("name") or source.named:
+    bodies = root.findall("worldbody/*")
+    if root.tag != "mujoco" or len(bodies) != 1 or not bodies[0].get("name"):
         return False
     return (
         _tags(root) <= _SECTIONS
         and {name for compiler in root.findall("compiler") for name in compiler.attrib} <= _IN_COMPILER
+        and not any({"gravity", "timestep"} & option.attrib.keys() for option in root.findall("option"))
+        and all(_tags(asset) <= _IN_ASSET for asset in root.findall("asset"))
         and all(_tags(default) <= _IN_DEFAULT for default in root.findall("default"))
         and bodies[0].find("freejoint") is not None
         and {element.tag for element in bodies[0].iter()} <= _IN_BODY
         and len(root.findall("keyframe/key")) <= 1
-        and root.find("asset/texture[@type='skybox']") is None
         and not any(SCENE.fullmatch(element.get("name", "")) for element in root.iter())
+        and all(_is_plain_attribute(*item) for element in root.iter() for item in element.items())
     )
+
+
+def _is_plain_attribute(name: str, value: str) -> bool:
+    """It names no file; its numbers, if it has any, are finite and of a size that machines have."""
+    if name.startswith("file"):
+        return False
+    lowest = 0.0 if name in _NOT_NEGATIVE else -_LARGEST
+    try:
+        numbers = [float(part) for part in value.split()]
+    except ValueError:  # text
+        return True
+    in_order = not name.endswith("range") or numbers == sorted(numbers)
+    return in_order and all(lowest <= number <= _LARGEST for number in numbers)
 
 
 def _tags(element: Element) -> set[str]:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
-from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
+from legged_mw.utils.motor_network import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
 
 Range = tuple[float, float]
 # what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]

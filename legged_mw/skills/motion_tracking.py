@@ -15,7 +15,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.skills.kinematics import Bodies, Kinematics, product, rotate
 from legged_mw.skills.motion_reference import Reference, angle_between, load_clips
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
-from legged_mw.utils.math import assign, quat_multiply, rotation_quat
+from legged_mw.utils.math import assign
 
 
 class MotionTracking(RobotTask):
@@ -188,3 +188,15 @@ class MotionTracking(RobotTask):
         self.body = self.remember(Bodies(*(torch.zeros_like(part) for part in self.reference.bodies)))
         self.anchor_pos, self.anchor_ori = self.buffer(3), self.buffer(6)
         self.body_pos, self.body_ori = self.buffer(3 * len(bodies)), self.buffer(6 * len(bodies))
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """The attitude (..., 4) that turns by ``b`` first, then by ``a``."""
+    w, u, s, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    return torch.cat([w * s - (u * v).sum(dim=-1, keepdim=True), w * v + s * u + torch.linalg.cross(u, v)], dim=-1)
+
+
+def rotation_quat(v: Tensor) -> Tensor:
+    """The attitude (..., 4) that turns about ``v`` (..., 3) by its length [rad]."""
+    half = v.norm(dim=-1, keepdim=True) / 2.0
+    return torch.cat([torch.cos(half), v * (0.5 * torch.sinc(half / torch.pi))], dim=-1)

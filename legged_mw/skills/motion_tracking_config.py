@@ -5,11 +5,15 @@ Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] 
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.utils.bounds import Duration, FileNames, NonNegative, NonNegativeVector, Positive, PositiveShare, Seconds
+from legged_mw.utils.bounds import THREE, Bound, Duration, NonNegative, Positive, PositiveShare, Seconds
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
+FileNames = list[Annotated[str, Bound("the name of a file", bool)]]
+NonNegativeVector = Annotated[list[NonNegative], THREE]
 _BEGINNINGS = {  # fields of init_state that are not read, as episodes begin in a clip -> fields of motion instead
     "pos_xy_range": "start_pos",
     "yaw_range": "start_turn",

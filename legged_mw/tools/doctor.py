@@ -238,11 +238,12 @@ def speed(name: str, device: str, seconds: float) -> str:
     """Train a task for so long and say how fast that was, and how long the whole training would take."""
     import torch
 
+    from legged_mw.rl.learner_config import fit_cpu
     from legged_mw.rl.runner import make_runner
 
     task, threads = load_task(name), torch.get_num_threads()
     if device == "cpu":
-        task.fit_cpu(usable_cores())
+        fit_cpu(task, usable_cores())
         torch.set_num_threads(1)  # as train.py does
     seed_everything(1)
     begun, quiet = time.perf_counter(), io.StringIO()

@@ -11,6 +11,7 @@ import torch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval.exams import make_exam
 from legged_mw.rl.layers import kernels_for
+from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.rl.runner import make_runner
 from legged_mw.sim.device import device_facts
 from legged_mw.utils.cli import Parser, pick_device
@@ -46,7 +47,7 @@ def warm(name: str, device: str) -> None:
     """Train a task for an iteration, and step its exam: all kernels that its training launches."""
     task = load_task(name, say=True)
     if device == "cpu":
-        task.fit_cpu(usable_cores())
+        fit_cpu(task, usable_cores())
         torch.set_num_threads(1)  # as train.py does
     env = task.env_class(task.cfg, device)
     env.fuse(task.train.runner.max_iterations * task.train.runner.num_steps_per_env)

@@ -1,23 +1,24 @@
-"""Bounds of a config's values, as types: the annotation of a field says what its number, list or table may hold.
+"""Bounds of a config's values, as types: a field's annotation limits its number, list or table.
 
     gamma: Share = 0.99
     interval: PositiveRange = [1.0, 3.0]
     stiffness: dict[str, NonNegative] = {}
 
-A number is finite whatever its type. Errors and the reference of fields show the same text: `bounds_text`.
+Every number is finite. Errors and the reference of fields show the same text: `bounds_text`.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
+from legged_mw.utils.errors import CONTROL
+
 
 class Bound(NamedTuple):
-    """What values of a type a field takes."""
+    """The values that a field takes."""
 
     text: str  # completes "it must be ..."
     holds: Callable[[Any], bool]
@@ -37,13 +38,10 @@ def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
     return Bound(f"{text}{unit and f' {unit}'}", lambda value: low < value <= most)
 
 
-_NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _ALWAYS = {
-    float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # no unit of a config needs more
-    # more than any machine counts, and few enough digits to print
+    float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # enough in every unit here
     int: Bound("below 10^24", lambda value: abs(value) < 10**24),
-    # which rule a terminal, or no file takes
-    str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),
+    str: Bound("text without control characters", lambda value: not CONTROL.search(value)),
 }
 
 
@@ -59,48 +57,23 @@ Positive = Annotated[float, above(0)]
 NonNegative = Annotated[float, at_least(0)]
 Scale = Annotated[float, Bound("another number than 0, and 10,000 at most", lambda value: 0 < abs(value) <= 1e4)]
 Share = Annotated[float, at_least(0, 1)]
-PositiveShare = Annotated[float, above(0, 1)]  # a share that is not 0
-Seconds = Annotated[float, above(0, 1e6, "s")]  # a million: what counts steps never overflows
-Duration = Annotated[float, at_least(0, 1e6, "s")]  # such a time, or none
-Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s]: no machine is as fast
+PositiveShare = Annotated[float, above(0, 1)]
+Seconds = Annotated[float, above(0, 1e6, "s")]  # a million, so that counters of steps never overflow
+Duration = Annotated[float, at_least(0, 1e6, "s")]  # the same, or 0
+Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s] more than any machine's
 Height = Annotated[float, at_least(0, 10, "m")]  # of a robot or of its feet
-Swing = Annotated[float, above(0, 10, "m")]  # such a height, that is not 0
 Angle = Annotated[float, Bound("from -2 pi to 2 pi rad, no degrees", lambda value: abs(value) <= 2 * math.pi)]
-Gain = Annotated[float, at_least(0, 1e6)]  # in SI units, of a joint or motor: no robot has more
+Gain = Annotated[float, at_least(0, 1e6)]  # of a joint or motor, in SI units: more than any robot's
 Sign = Annotated[float, Bound("1 or -1", lambda value: value in (1, -1))]
 
 Count = Annotated[int, at_least(1)]
 NonNegativeInt = Annotated[int, at_least(0)]
-SmallInt = Annotated[int, at_least(1, 1000)]  # of what is repeated in a loop, where more would never end
-Iterations = Annotated[int, at_least(0, 1_000_000)]
+SmallInt = Annotated[int, at_least(1, 1000)]  # repetitions in a loop, which would never end with more
 Threads = Annotated[int, at_least(0, 1024)]
-Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
 
 Names = Annotated[list[str], SOME]
-Points = Annotated[list[Annotated[float, at_least(-100, 100, "m")]], SOME]
-FileNames = list[Annotated[str, Bound("the name of a file", bool)]]
-Sizes = Annotated[list[Count], SOME]  # of layers
-NonNegativeVector = Annotated[list[NonNegative], THREE]
 Range = Annotated[list[float], PAIR]
 PositiveRange = Annotated[list[Positive], PAIR]
-ShareRange = Annotated[list[Share], PAIR]
-
-# Of a range that nothing needs to be drawn from: empty, it is left out
-Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
-Frictions = Annotated[
-    list[
-        Annotated[
-            float, Bound("from 1e-05, as which MuJoCo takes all below it, to 1000", lambda value: 1e-5 <= value <= 1000)
-        ]
-    ],
-    or_empty(PAIR),
-]
-Places = Annotated[list[Annotated[float, at_least(-10, 10, "m")]], or_empty(PAIR)]
-ContactTimes = Annotated[list[Annotated[float, at_least(1e-4, 10, "s")]], or_empty(PAIR)]
-Offsets = Annotated[list[float], or_empty(PAIR)]
-Shares = Annotated[list[Share], or_empty(PAIR)]
-Delays = Annotated[list[NonNegative], or_empty(PAIR)]
-StepDelays = Annotated[list[NonNegativeInt], or_empty(PAIR)]
 
 
 def bare(kind: Any) -> Any:
@@ -116,14 +89,14 @@ def bare(kind: Any) -> Any:
 
 
 def bounds_of(kind: Any) -> list[Bound]:
-    """The bounds of the type itself, not of what it contains; a bare type has what holds always."""
+    """The bounds of the type itself, not of its elements. A bare type has those of all its values."""
     if get_origin(kind) is Annotated:
         return [bound for bound in get_args(kind)[1:] if isinstance(bound, Bound)]
     return [_ALWAYS[kind]] if kind in _ALWAYS else []
 
 
 def bounds_text(kind: Any) -> str:
-    """What a value of the type must be, in words that complete "it must be ..."; "" for a type without bounds."""
+    """The bounds of a type, in words that complete "it must be ..."; "" if it has none."""
     origin, args = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return "; ".join(filter(None, [*(bound.text for bound in bounds_of(kind)), bounds_text(args[0])]))

@@ -1,4 +1,4 @@
-"""What the programs share on the command line: flags, one-line errors, durations, seeds. Imports without torch and numpy."""
+"""What all programs share: flags, one-line errors, durations, seeds. Imports neither torch nor numpy at the top."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from legged_mw.utils.console import patient_console
 from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
-FEWER_WORLDS = "; fewer worlds need less: try half with --num_envs"  # of the programs that have the flag
+FEWER_WORLDS = "; fewer worlds need less: try half with --num_envs"  # for programs with this flag
 
 
 class Parser(argparse.ArgumentParser):
@@ -34,15 +34,12 @@ class Parser(argparse.ArgumentParser):
         )
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse's, but a flag that does not exist is answered with the nearest one."""
+        """As argparse's, but the error about an unknown flag names the nearest one."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
             flags = [word.partition("=")[0] for word in unknown if word.startswith("-")]
-            near = [
-                close[0]
-                for flag in flags
-                if (close := difflib.get_close_matches(flag, self._option_string_actions, n=1))
-            ]
+            known = self._option_string_actions
+            near = [name for flag in flags for name in difflib.get_close_matches(flag, known, n=1)]
             hint = f"; did you mean {', '.join(near)}?" if near else ""
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return found
@@ -52,7 +49,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def make_parser(description: str | None) -> Parser:
-    """A parser with the flags that both programs know, under legged_gym's names."""
+    """A parser with the flags of both train and play, under legged_gym's names."""
     parser = Parser(description=description, allow_abbrev=False)
     parser.add_argument("--task", metavar="NAME", help="a task in configs/, or the path of a config file")
     parser.add_argument("--num_envs", type=positive, metavar="N", help="worlds stepped together")
@@ -75,7 +72,7 @@ def make_parser(description: str | None) -> Parser:
 
 
 def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
-    """Files first, then single fields, then flags: the more specific wins."""
+    """Apply --override, then --set, then flags of single fields: the more specific wins."""
     for file in args.override:
         task.update(load_yaml(file), where=f"--override {file}")
     for item in args.set:
@@ -94,22 +91,21 @@ def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
         task.train.seed = random.SystemRandom().randrange(2**31)
 
 
-def pick_device(asked: str | None) -> str:
-    """The device asked for, or the best there is; a clear error for one that is not there."""
-    import torch  # here alone: legged_mw.deploy shares this file, and runs where torch is not installed
+def pick_device(name: str | None) -> str:
+    """The device called ``name``, or the best one if that is None. Raises ConfigError if it does not exist."""
+    import torch  # not at the top: legged_mw.deploy imports this file and runs without torch
 
-    if asked is None:
+    if name is None:
         return "cuda:0" if torch.cuda.is_available() else "cpu"
-    if re.fullmatch(r"cuda(:\d+)?", asked):
-        index = int(asked.partition(":")[2] or 0)
+    if re.fullmatch(r"cuda(:\d+)?", name):
+        index = int(name.partition(":")[2] or 0)
         if index < torch.cuda.device_count():
             return f"cuda:{index}"
-        raise ConfigError(
-            f"--device {asked}: this machine has {torch.cuda.device_count()} CUDA devices; use --device cpu"
-        )
-    if asked != "cpu":
-        raise ConfigError(f"--device {asked}: say cpu, cuda, or cuda:<index>")
-    return asked
+        have = f"this machine has {torch.cuda.device_count()} CUDA devices"
+        raise ConfigError(f"--device {name}: {have}; use --device cpu")
+    if name != "cpu":
+        raise ConfigError(f"--device {name}: say cpu, cuda, or cuda:<index>")
+    return name
 
 
 def seed_everything(seed: int) -> None:
@@ -123,7 +119,7 @@ def seed_everything(seed: int) -> None:
 
 
 def positive(text: str) -> int:
-    """A whole number from 1, for argparse."""
+    """A positive whole number, for argparse."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not a positive number")
@@ -131,7 +127,7 @@ def positive(text: str) -> int:
 
 
 def number(kind: Any) -> Callable[[str], Any]:
-    """For argparse: a number of the type ``kind``, a bound of utils/bounds.py or a bare type."""
+    """A reader of numbers for argparse; ``kind`` is a type of utils/bounds.py, or int or float."""
 
     def read(text: str) -> Any:
         try:
@@ -143,7 +139,7 @@ def number(kind: Any) -> Callable[[str], Any]:
 
 
 def duration(text: str) -> float:
-    """Seconds in "90", "90s", "5m" or "1.5h", for argparse; at most some thirty years, which every clock can hold."""
+    """Seconds of "90", "90s", "5m" or "1.5h", for argparse; at most 1e9 s, about thirty years."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", text)
     seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
     if not 0.0 < seconds < 1e9:
@@ -153,10 +149,10 @@ def duration(text: str) -> float:
 
 @contextmanager
 def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
-    """Turn mistakes of the user, in what was asked or in code of their own, into one line and exit code 2; with --verbose all of it.
+    """End the program with one line and exit code 2 after a mistake of the user, in a request or in their own code.
 
-    Memory that runs out becomes that, with the advice ``fewer``, Ctrl-C a word and code 130. A mistake of ours stays a traceback.
-    What is printed inside may find no reader, as in ``| head``, and ends nothing.
+    --verbose adds the traceback. If memory runs out, the line ends with the advice ``fewer``. Ctrl-C gives code 130.
+    Our own mistakes stay tracebacks. If the console closes, as in ``| head``, the program goes on.
     """
     program = program or Path(sys.argv[0]).name
     try:
@@ -165,29 +161,21 @@ def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
     except UserError as error:
         _show_all()
         fail(program, str(error))
-    except (KeyboardInterrupt, ArgumentError) as error:  # ctypes wraps one that comes while it converts an argument
+    except (KeyboardInterrupt, ArgumentError) as error:  # ctypes may wrap the former in the latter
         if "KeyboardInterrupt" not in repr(error):
             raise
         print(f"\n{program}: stopped", file=sys.stderr)
         raise SystemExit(130) from None
-    except (RuntimeError, MemoryError) as error:
+    except Exception as error:
         first: BaseException = error
         while first.__context__ is not None:
-            first = first.__context__  # what ran out may show as the failure of what it interrupted
-        if not out_of_memory(first) and not out_of_memory(error):
-            _blame_user(program, error)
-            raise
-        fail(program, f"out of memory ({(str(first) or 'memory').splitlines()[0]}){fewer}")
-    except Exception as error:
-        _blame_user(program, error)
+            first = first.__context__  # a lack of memory often shows as another error that follows
+        if isinstance(error, RuntimeError | MemoryError) and (out_of_memory(first) or out_of_memory(error)):
+            fail(program, f"out of memory ({(str(first) or 'memory').splitlines()[0]}){fewer}")
+        if where := users_fault(error):
+            _show_all()
+            fail(program, f"{where}: {in_short(error)}; --verbose shows the whole traceback")
         raise
-
-
-def _blame_user(program: str, error: Exception) -> None:
-    """Fail with the user's own lines, if some of them led to ``error``."""
-    if where := users_fault(error):
-        _show_all()
-        fail(program, f"{where}: {in_short(error)}; --verbose shows the whole traceback")
 
 
 def _show_all() -> None:
@@ -196,17 +184,16 @@ def _show_all() -> None:
 
 
 def fail(program: str, message: str) -> NoReturn:
-    """One line on standard error, exit code 2."""
-    with suppress(OSError):  # nobody may be there to read it
+    """Print one line to standard error; exit with code 2."""
+    with suppress(OSError):  # it may be closed
         print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 
 def command(program: str, processes: int = 1) -> str:
-    """How the user starts ``train`` or ``play``: as the script of a clone, or as ``legged-mw train``."""
+    """How the user starts ``train`` or ``play``: ``python train.py`` in a clone, else ``legged-mw train``."""
     installed = Path(sys.argv[0]).name.startswith("legged-mw")
     if processes > 1:
-        return f"torchrun --nproc_per_node={processes} " + (
-            f"-m legged_mw.programs {program}" if installed else f"{program}.py"
-        )
+        script = f"-m legged_mw.programs {program}" if installed else f"{program}.py"
+        return f"torchrun --nproc_per_node={processes} {script}"
     return f"legged-mw {program}" if installed else f"python {program}.py"

@@ -1,18 +1,16 @@
-"""Class-based configuration: a field is declared once, with a type, and every later word about it is checked.
+"""Class-based configuration: a field is declared once, with a type, and every later value of it is checked.
 
-Here live the rule (annotated = declares, bare = overrides) and the types that fields may have; utils/bounds.py has their bounds.
-No field of any robot, simulator or trainer lives here, nor anything that gives a number its meaning.
+Here live the rule (annotated = declares, bare = overrides) and the types of fields; utils/bounds.py has their bounds.
+Fields of robots, simulators and trainers live elsewhere, and so does the meaning of their numbers.
 """
 
 from __future__ import annotations
 
-import ast
 import difflib
 import inspect
 import keyword
 import re
 import sys
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
 from types import NoneType, SimpleNamespace, UnionType
@@ -22,22 +20,21 @@ from weakref import WeakKeyDictionary
 from legged_mw.utils.bounds import bare, bounds_of, bounds_text
 from legged_mw.utils.errors import ConfigError, brief
 from legged_mw.utils.files import note_file
-from legged_mw.utils.renamed import new_name
 from legged_mw.utils.yaml_file import load_yaml, parse_yaml, save_yaml
 
 __all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_yaml", "save_yaml", "type_text"]
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
-_PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
+_PLAIN = None | bool | int | float | str | list | dict  # what `Any` means in a config: all that YAML can hold
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
 
 class OutOfBounds(ConfigError):
-    """A value of the right type that its field does not take."""
+    """A value of the right type, outside of its field's bounds."""
 
 
 def _schema(cls: type) -> dict[str, Any]:
-    """Name -> type of each field, or class of each section, the parents' first; checks `cls` on first sight."""
+    """Name -> type of each field or class of each section, the parents' first. Checks `cls` the first time."""
     if cls in _SCHEMAS:
         return _SCHEMAS[cls]
     known: dict[str, Any] = {}
@@ -55,22 +52,20 @@ def _schema(cls: type) -> dict[str, Any]:
             fields[name] = kind
         if _is_section(kind):
             _schema(kind)
-            # all that is ever added to a section: it stays the user's plain class
-            fields[name].__setattr__ = _guarded_setattr
-    if vars(cls).get("_only"):  # what it inherits and does not write itself is 0
+            fields[name].__setattr__ = _guarded_setattr  # the only thing ever added to a section's class
+    if vars(cls).get("_only"):  # inherited fields that it does not write itself are 0
         if not getattr(cls, "_open", False):
-            raise ConfigError(
-                f"{_place(cls, '_only')}: {_path(cls)} is not an open table of numbers: leave `_only` out of it"
-            )
+            wrong = f"{_path(cls)} is not an open table of numbers: leave `_only` out of it"
+            raise ConfigError(f"{_place(cls, '_only')}: {wrong}")
         for name in known.keys() - vars(cls).keys():
             setattr(cls, name, 0.0)
     return _SCHEMAS.setdefault(note_file(cls), fields)
 
 
 def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
-    """The type or section that `name` stands for in `cls`, whose parents know `known`; None for a method."""
+    """The type or section of `name` in `cls`, given the fields `known` to its parents; None for a method."""
     path, inherited, value = f"{_path(cls)}.{name}", known.get(name), getattr(cls, name, None)
-    annotated = name in inspect.get_annotations(cls)
+    parent, annotated = cls.__bases__[0], name in inspect.get_annotations(cls)
     if _is_section(value) and not annotated:
         return _check_section(cls, name, value, inherited)
     if name not in vars(cls) and not annotated:
@@ -78,15 +73,14 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
     if inherited is None and not annotated and (inspect.isroutine(value) or isinstance(value, property)):
         return None
     if _is_section(inherited):
-        raise ConfigError(
-            f"{path} is a section, not a field; write `class {name}({_parents(cls, name)}):` and its fields below"
-        )
+        write = f"`class {name}({_parents(cls, name)}):` and its fields below"
+        raise ConfigError(f"{path} is a section, not a field; write {write}")
     if inherited is None and any(hasattr(base, name) for base in cls.__bases__):
-        raise ConfigError(f"{path} would hide the method '{name}' of {_path(cls.__bases__[0])}; choose another name")
+        raise ConfigError(f"{path} would hide the method '{name}' of {_path(parent)}; choose another name")
     if annotated:
         kind = _declared_type(cls, name, inherited)
     elif inherited is None and not getattr(cls, "_open", False):
-        hint = _suggest(path, known) + (f"; {_path(cls.__bases__[0])} has: {', '.join(known)}" if known else "")
+        hint = _nearest(name, known) + (f"; {_path(parent)} has: {', '.join(known)}" if known else "")
         declaration = f"`{name}: {type(value).__name__} = {value!r}`"
         raise ConfigError(f"{path} overrides nothing{hint}; if the field is new, declare it with a type: {declaration}")
     else:
@@ -96,7 +90,7 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
 
 
 def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
-    """`section`, if it extends every section of this name that the parents of `cls` have; these joined, if `cls` writes none."""
+    """The section `name` of `cls`. It must extend the sections of this name in all parents of `cls`."""
     path = f"{_path(cls)}.{name}"
     if inherited is not None and not _is_section(inherited):
         raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
@@ -106,38 +100,34 @@ def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
     for dropped in theirs:
         if not issubclass(section, dropped):
             extends = ", ".join(_path(base) for base in section.__bases__ if base is not object) or "no section"
-            raise ConfigError(
-                f"{path} extends {extends} and so drops the fields of {_path(dropped)} ({', '.join(_schema(dropped))}); "
-                f"write `class {name}({_parents(cls, name)}):`"
-            )
+            fields = f"{_path(dropped)} ({', '.join(_schema(dropped))})"
+            write = f"`class {name}({_parents(cls, name)}):`"
+            raise ConfigError(f"{path} extends {extends} and so drops the fields of {fields}; write {write}")
     return section
 
 
 def _joined(cls: type, name: str, sections: list[type]) -> type:
-    """The section of a class that does not write it: all that its parents' `sections` write, the first one's word before the next's."""
-    last = [kind for kind in dict.fromkeys(sections) if not _is_extended(kind, sections)]
-    if len(last) == 1:
-        section = last[0]
-    else:
+    """The section of a class that writes none: the fields of all its parents' `sections`. The first parent wins."""
+    last = [
+        section
+        for section in dict.fromkeys(sections)
+        if not any(other is not section and issubclass(other, section) for other in sections)
+    ]
+    joined = last[0]
+    if len(last) > 1:
         names = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.{name}"}
-        section = type(name, tuple(last), names)
-    if section is not getattr(cls, name):
-        setattr(cls, name, section)
-    return section
-
-
-def _is_extended(section: type, others: list[type]) -> bool:
-    return any(other is not section and issubclass(other, section) for other in others)
+        joined = type(name, tuple(last), names)
+    if joined is not getattr(cls, name):
+        setattr(cls, name, joined)
+    return joined
 
 
 def _declared_type(cls: type, name: str, inherited: Any) -> Any:
-    """The type that `cls` annotates `name` with: resolvable, supported, followed by a value, the same as the parents'."""
+    """The annotation of `name` in `cls`. It must be supported, come with a value, and agree with the parents'."""
     path, written = f"{_path(cls)}.{name}", inspect.get_annotations(cls)[name]
-    module = sys.modules.get(cls.__module__)
+    names = vars(sys.modules[cls.__module__]) if cls.__module__ in sys.modules else {}
     try:
-        kind = get_type_hints(
-            SimpleNamespace(__annotations__={name: written}), vars(module) if module else {}, include_extras=True
-        )[name]
+        kind = get_type_hints(SimpleNamespace(__annotations__={name: written}), names, include_extras=True)[name]
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
         hint = f"import what it names at the top level of module {cls.__module__}"
         raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
@@ -146,14 +136,15 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
         raise ConfigError(f"{path}: type {type_text(kind)} is not supported; there are {choice}")
     if name not in vars(cls):
         raise ConfigError(f"{path} has a type but no value; write `{name}: {type_text(kind)} = ...`")
-    if inherited is not None and bare(inherited) == bare(kind) and bounds_text(kind) in ("", bounds_text(inherited)):
+    if inherited is None:
+        return kind
+    if bare(inherited) == bare(kind) and bounds_text(kind) in ("", bounds_text(inherited)):
         return inherited
-    if inherited is not None:
-        first = next(base for base in cls.__mro__[1:] if name in _schema(base))
-        raise ConfigError(
-            f"{path} is a {_full(inherited)} in {_path(first)}, not a {_full(kind)}; to override it write `{name} = ...`"
-        )
-    return kind
+    first = _path(next(base for base in cls.__mro__[1:] if name in _schema(base)))
+    declared, here = (
+        type_text(each) + (f" ({bounds_text(each)})" if bounds_text(each) else "") for each in (inherited, kind)
+    )
+    raise ConfigError(f"{path} is a {declared} in {first}, not a {here}; to override it write `{name} = ...`")
 
 
 def _is_supported(kind: Any) -> bool:
@@ -174,7 +165,7 @@ def _is_section(kind: Any) -> TypeGuard[type]:
 
 
 def _path(cls: type) -> str:
-    """`Go1.rewards.scales`: the name that Python gives a nested class is the dotted path of the section."""
+    """`Go1.rewards.scales`: Python's qualified name of a nested class is the dotted path of the section."""
     return cls.__qualname__.rpartition("<locals>.")[2]
 
 
@@ -190,19 +181,8 @@ def type_text(kind: Any) -> str:
     return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
 
 
-def _full(kind: Any) -> str:
-    """A type with its bounds."""
-    return type_text(kind) + (f" ({bounds})" if (bounds := bounds_text(kind)) else "")
-
-
-def _suggest(path: str, fields: Mapping[str, Any]) -> str:
-    """`; it is called ... now` where the field at `path` was renamed, else `_nearest`."""
-    new = new_name(path)
-    return f"; it is called {new} now" if new else _nearest(path.rpartition(".")[2], fields)
-
-
 def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
-    """`; did you mean ...?`: the nearest name here, else the same name in a section further down, else nothing."""
+    """`; did you mean ...?` with the nearest name, else with the same name in a section further down; else ''."""
     near = difflib.get_close_matches(name, fields, n=1)
     if not near and isinstance(fields, Mapping):
         near = [path for path, _ in _walk(fields) if path.rpartition(".")[2] == name]
@@ -210,7 +190,7 @@ def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
 
 
 def field_types(cls: type) -> Iterator[tuple[str, Any]]:
-    """(dotted path, type) of every field of a config class, in the order of declaration. `bounds_text` says a type's bounds."""
+    """(dotted path, type) of every field of a config class, in the order of declaration."""
     yield from _walk(_schema(cls))
 
 
@@ -220,22 +200,18 @@ def _walk(fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _place(cls: type, name: str) -> str:
-    """`file:line` where `cls` says something of `name`. Reads the source, which is dear, but only errors ask."""
+    """`file:line` where `cls` writes `name`. Reads the source, which is slow: for errors only."""
     try:
         lines, first = inspect.getsourcelines(cls)
-        [statement] = ast.parse(textwrap.dedent("".join(lines))).body
-        for line in getattr(statement, "body", []):
-            targets = [getattr(line, "target", None), *getattr(line, "targets", [])]
-            if name in (getattr(line, "name", None), *(getattr(target, "id", None) for target in targets)):
-                first += line.lineno - 1
-                break
-        return f"{inspect.getsourcefile(cls)}:{first}"
-    except (OSError, TypeError, SyntaxError, ValueError):  # written at a prompt, or by code
+    except (OSError, TypeError):  # written at a prompt, or by code
         return f"module {cls.__module__}"
+    written = [i for i, line in enumerate(lines) if re.match(rf"\s+(class\s+)?{name}\s*[:=(]", line)]
+    outermost = min(written, key=lambda i: len(lines[i]) - len(lines[i].lstrip()), default=0)
+    return f"{inspect.getsourcefile(cls)}:{first + outermost}"
 
 
 def fit(value: Any, kind: Any, path: str) -> Any:
-    """`value` as a `kind`: an int becomes a float where one is due, containers are copied. `path` names it in errors."""
+    """`value` as a `kind`: an int becomes a float if need be, containers are copied. Errors begin with `path`."""
     origin: Any = get_origin(kind) or kind
     args = get_args(kind)
     if _is_section(kind):
@@ -245,7 +221,7 @@ def fit(value: Any, kind: Any, path: str) -> Any:
             fitted = fit(value, args[0], path)
         except OutOfBounds:
             if args[0] in (int, float):
-                _within(value, kind, path)  # what the field takes says more than what every number must be
+                _within(value, kind, path)  # the field's own bounds say more than those of every number
             raise
         return _within(fitted, kind, path)
     if kind is Any or origin in (Union, UnionType):
@@ -269,7 +245,7 @@ def fit(value: Any, kind: Any, path: str) -> Any:
 
 
 def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
-    """`value` as one type of a union, its own first: 3 must stay an int in `float | int`."""
+    """`value` as one of the types of a union. Its own type is tried first: 3 stays an int in `float | int`."""
     outside: list[OutOfBounds] = []
     for arm in sorted(get_args(kind), key=lambda arm: (get_origin(bare(arm)) or bare(arm)) is not type(value)):
         try:
@@ -278,14 +254,9 @@ def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
             outside.append(error)
         except ConfigError:
             continue
-    if len(outside) == 1:
+    if outside:
         raise outside[0]
-    wrong = (
-        f"is {brief(value)}; it must be {bounds_text(kind)}"
-        if outside
-        else f"must be {type_text(kind)}, not {brief(value)}"
-    )
-    raise ConfigError(f"{path} {wrong} ({type(value).__name__})")
+    raise ConfigError(f"{path} must be {type_text(kind)}, not {brief(value)} ({type(value).__name__})")
 
 
 def _within(value: Any, kind: Any, path: str) -> Any:
@@ -313,7 +284,7 @@ def _parse(text: str, kind: Any, path: str) -> Any:
 
 
 def _kind(cls: type, name: str, path: str) -> Any:
-    """The type or section of `name` in an instance of `cls`."""
+    """The type or section of `name` in `cls`, the section at `path`. Raises ConfigError if there is none."""
     fields = _schema(cls)
     if name in fields:
         return fields[name]
@@ -321,7 +292,7 @@ def _kind(cls: type, name: str, path: str) -> Any:
     if is_free and getattr(cls, "_open", False):
         return float
     owner = path.rpartition(".")[0] or _path(cls)
-    raise ConfigError(f"{path} does not exist{_suggest(path, fields)}; {owner} has: {', '.join(fields)}")
+    raise ConfigError(f"{path} does not exist{_nearest(name, fields)}; {owner} has: {', '.join(fields)}")
 
 
 def _guarded_setattr(self: Any, name: str, value: Any) -> None:
@@ -332,13 +303,13 @@ def _guarded_setattr(self: Any, name: str, value: Any) -> None:
 
 
 def _fill(node: Any) -> Any:
-    """Gives `node` a copy of its own of every default, in the order of declaration."""
+    """Give `node` its own copy of every default, in the order of declaration."""
     cls = type(node)
     for name, kind in _schema(cls).items():
-        default = getattr(cls, name)
-        vars(node)[name] = (
-            _fill(object.__new__(kind)) if _is_section(kind) else fit(default, kind, f"{_path(cls)}.{name}")
-        )
+        if _is_section(kind):
+            vars(node)[name] = _fill(object.__new__(kind))
+        else:
+            vars(node)[name] = fit(getattr(cls, name), kind, f"{_path(cls)}.{name}")
     return node
 
 
@@ -359,11 +330,10 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, Any]]:
-    """(section, name, value) for every field that the nested `values` name, each checked."""
+    """(section, name, checked value) of every field in the nested `values`."""
     if not isinstance(values, Mapping):
-        raise ConfigError(
-            f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {brief(values)}"
-        )
+        where = path or _path(type(node))
+        raise ConfigError(f"{where} is a section and needs a mapping of its fields, not {brief(values)}")
     for name, value in values.items():
         here = f"{path}.{name}" if path else str(name)
         kind = _kind(type(node), str(name), here)
@@ -376,11 +346,11 @@ def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, A
 class Config:
     """Base of every configuration: nested plain classes are its sections, their attributes its fields.
 
-    `name: type = value` declares a field; in a subclass a bare `name = value` overrides it, and `class env(Parent.env):`
-    a section. A class of several parents has all that they write in the sections that it does not write itself; of two words
-    the first parent's wins. A section with `_open = True` takes any new bare `name = number` too; `_only = True` in a subclass
-    of that sets to 0 what it does not write itself. All is checked when the class statement runs, and whenever a field is set.
-    An instance owns a copy of every default.
+    `name: type = value` declares a field. In a subclass `name = value` overrides it, and `class env(Parent.env):` a
+    section. A class with several parents joins their sections; if two parents set a field, the first one wins.
+    A section with `_open = True` also takes new fields by a bare `name = number`. In its subclass `_only = True` sets
+    every other field to 0. All is checked when the class statement runs, and when a field is set. An instance owns a
+    copy of every default.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -390,34 +360,31 @@ class Config:
     def __init__(self) -> None:
         _fill(self)
 
-    if not TYPE_CHECKING:  # a visible __setattr__ would tell type checkers that any name may be set
+    if not TYPE_CHECKING:  # else type checkers would allow any name to be set
         __setattr__ = _guarded_setattr
 
     def to_dict(self) -> dict[str, Any]:
-        """Nested dicts, lists, numbers, strings and None, in the order of declaration: safe for YAML."""
+        """Nested dicts, lists, numbers, strings and None, in the order of declaration, as YAML can hold them."""
         return _plain(self)
 
     def set(self, path: str, value: Any, where: str = "--set") -> None:
-        """Overrides the field at a dotted `path`; text is read by the field's type. Errors begin with `where`."""
-        node, here = self, ""
-        *sections, name = path.split(".")
+        """Override the field at a dotted `path`. Text is read by the field's type. Errors begin with `where`."""
+        owner, node, kind, here = self, self, type(self), ""
         try:
-            for section in sections:
-                here = f"{here}.{section}" if here else section
-                kind = _kind(type(node), section, here)
+            for name in path.split("."):
                 if not _is_section(kind):
                     whole = f": {here}={{{path.removeprefix(f'{here}.')}: ...}}" if get_origin(kind) is dict else ""
-                    raise ConfigError(
-                        f"{path} does not exist: {here} is a field ({type_text(kind)}), not a section; set it whole{whole}"
-                    )
-                node = getattr(node, section)
-            kind = _kind(type(node), name, path)
-            vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else fit(value, kind, path)
+                    why = f"{here} is a field ({type_text(kind)}), not a section; set it whole{whole}"
+                    raise ConfigError(f"{path} does not exist: {why}")
+                here = f"{here}.{name}" if here else name
+                owner, kind = node, _kind(type(node), name, here)
+                node = getattr(owner, name, None)
+            vars(owner)[name] = _parse(value, kind, path) if isinstance(value, str) else fit(value, kind, path)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
 
     def update(self, values: Mapping[str, Any], where: str = "update") -> None:
-        """Overrides every field that the nested `values` name, or none if one is wrong. A dict field is replaced whole."""
+        """Override all fields in the nested `values`, or none if one is wrong. A dict field is replaced whole."""
         try:
             edits = list(_edits(self, values))
         except ConfigError as error:
@@ -426,7 +393,7 @@ class Config:
             vars(node)[name] = value
 
     def diff(self, other: Config) -> list[tuple[str, Any, Any]]:
-        """(dotted path, mine, theirs) of every field that differs; None stands for a field that one side lacks."""
+        """(dotted path, own value, value in `other`) of all fields that differ; None: this side lacks it."""
         mine, theirs = dict(_leaves(self)), dict(_leaves(other))
         both = mine.keys() & theirs.keys()
         return [

@@ -1,11 +1,11 @@
-"""A console whose reader may leave: what is printed then is lost, and the program goes on."""
+"""A console that may close, as in ``| head``: later prints are lost, and the program goes on."""
 
 from __future__ import annotations
 
 import errno
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any, TextIO
 
@@ -13,42 +13,37 @@ _GONE = (errno.EPIPE, errno.EIO, errno.EBADF)  # a closed pipe, a terminal that 
 
 
 class SafeStream:
-    """A stream that loses what cannot be written."""
+    """A stream that drops what cannot be written."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        with self._surviving():
-            self._stream.write(text)
+        self._try(self._stream.write, text)
         return len(text)
 
     def flush(self) -> None:
-        with self._surviving():
-            self._stream.flush()
+        self._try(self._stream.flush)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    @contextmanager
-    def _surviving(self) -> Iterator[None]:
+    def _try(self, call: Callable[..., object], *args: str) -> None:
         try:
-            yield
-        except (OSError, ValueError) as error:
-            if isinstance(error, OSError) and error.errno in _GONE:
-                self._give_up()
-
-    def _give_up(self) -> None:
-        """Nobody reads it any more: not what Python still holds back either, which it would complain about at the end."""
-        with suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            call(*args)
+        except ValueError:  # the stream is closed
+            return
+        except OSError as error:
+            if error.errno in _GONE:
+                with suppress(OSError, ValueError):  # Python flushes its buffer at the end, too: send that nowhere
+                    nowhere = os.open(os.devnull, os.O_WRONLY)
+                    os.dup2(nowhere, self._stream.fileno())
+                    os.close(nowhere)
 
 
 @contextmanager
 def patient_console() -> Iterator[None]:
-    """What is printed inside may be lost, and ends nothing."""
+    """Inside, a print that fails is dropped."""
     out, err = SafeStream(sys.stdout), SafeStream(sys.stderr)
     with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
         try:

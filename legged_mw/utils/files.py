@@ -1,12 +1,10 @@
-"""Files and folders by their names: those that a config names, found by where the name was written, and those of strangers."""
+"""Files and folders: those that a config names, those that a flag wants written, and those that strangers made."""
 
 from __future__ import annotations
 
 import errno
 import hashlib
 import os
-import re
-import shutil
 import stat
 import sys
 import tempfile
@@ -19,111 +17,108 @@ from weakref import WeakKeyDictionary
 from legged_mw import ROOT
 from legged_mw.utils.errors import UserError, shown
 
-STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
-MOST_LETTERS = 100  # of a folder's name, in bytes: systems allow 255, and ours is put before or behind it
-MOST_UNPACKED = 1 << 30  # of all arrays in an .npz: hours of a robot's motion
+STAGED = ".export.new"  # folder within an export: all files of a newer export, to be moved into place
+MOST_LETTERS = 100  # [bytes] of a folder's name: systems allow 255, and we add a time and a number
+MOST_UNPACKED = 1 << 30  # [bytes] of all arrays in an .npz: hours of a robot's motion
 _FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
 
 
 def note_file(cls: type) -> type:
-    """Remember which file ``cls`` is written in; returns it. Called as its statement runs: later its module's name may be another's."""
+    """Remember which file ``cls`` is written in, and return it. Later another module may have the same name."""
     if file := getattr(sys.modules.get(cls.__module__), "__file__", None):
         _FILES.setdefault(cls, Path(file).resolve())
     return cls
 
 
 def find_file(cfg: Any, path: str, one: str = "") -> Path:
-    """The file that the config field ``path`` ("asset.file") names, or ``one`` of those that it lists. Raises UserError.
+    """The file named by the config field ``path`` ("asset.file"), or ``one`` of those that it lists. Raises UserError.
 
-    A relative name that a class body wrote is looked for beside that body's file. One that came later, by a flag or from a
-    run, is looked for in the current folder, beside the task and beside the classes that it extends. Last comes the repository.
+    A relative name in a class body is looked for beside the file of that class. A name from a flag or a run is looked
+    for in the current folder, beside the task, and beside the classes that it extends. The repository comes last.
     """
     section, _, name = path.rpartition(".")
     owner = getattr(cfg, section)
     written = Path(one or getattr(owner, name)).expanduser()
     author = next(cls for cls in type(owner).__mro__ if name in vars(cls))
-    folders = [_folder(author)]
+    folders, classes = list[Path](), [author]
     if getattr(owner, name) != getattr(author, name):
-        folders = [
-            Path.cwd(),
-            Path(getattr(cfg, "_folder", "")),
-            *map(_folder, [*type(owner).__mro__, *type(cfg).__mro__]),
-        ]
-    places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder and folder.is_absolute()))
+        folders = [Path.cwd(), Path(getattr(cfg, "_folder", ""))]
+        classes = [*type(owner).__mro__, *type(cfg).__mro__]
+    folders += [_FILES[cls].parent for cls in classes if cls in _FILES]
+    places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder.is_absolute()))
     for file in (place / written for place in places):  # an absolute path stays itself
         if file.is_file():
             return file
     if written.is_absolute():
-        raise UserError(
-            f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's"
-        )
+        why = "an absolute path is of one machine: name the file relative to the task's"
+        raise UserError(f"{path}: no file at {written}; {why}")
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
 
 
 def writable(name: str, flag: str, folder: bool = False) -> Path:
-    """The file, or folder, that ``flag`` says to write, if it can be: asked before the work. Raises UserError.
+    """The file or folder that ``flag`` wants written. Raises UserError, before any work, if that is not possible.
 
-    Folders on the way need not be there. A file without a name is tried beside it, which leaves nothing.
+    Folders on the way need not exist. The check leaves nothing behind.
     """
     path = Path(name)
+    kind, other = ("folder", "file") if folder else ("file", "folder")
+    if not name.strip():
+        raise UserError(f"{flag} is empty: name the {kind} to write")
     try:
-        if not name.strip():
-            raise UserError(f"{flag} is empty: name the {'folder' if folder else 'file'} to write")
         with suppress(FileNotFoundError, NotADirectoryError):
             path.lstat()  # raises for a name that no file can have
         if path.exists() and path.is_dir() != folder:
-            raise UserError(
-                f"{flag} {name}: that is a {'file' if folder else 'folder'}; name a {'folder' if folder else 'file'}"
-            )
-        there = next(place for place in (path.absolute(), *path.absolute().parents) if place.is_dir())
-        if blocks := [place for place in path.absolute().parents if place.exists() and not place.is_dir()]:
-            raise UserError(f"{flag} {name}: {blocks[0]} is a file, not a folder")
-        with tempfile.TemporaryFile(dir=there):
+            raise UserError(f"{flag} {name}: that is a {other}; name a {kind}")
+        there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
+        if there.is_file() and there != path.absolute():
+            raise UserError(f"{flag} {name}: {there} is a file, not a folder")
+        with tempfile.TemporaryFile(dir=there if there.is_dir() else there.parent):
             pass
-        if path.is_file() and not os.access(path, os.W_OK):
+        if there.is_file() and not os.access(there, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # a name too long, or with a null character
-        raise UserError(
-            f"{flag} {name[:200]}: cannot be written: {getattr(error, 'strerror', None) or error}"
-        ) from None
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"{flag} {name[:200]}: cannot be written: {why}") from None
     return path
 
 
 def check_name(name: str, where: str) -> str:
-    """``name`` if a folder may be called so, in any system and terminal, and it leads nowhere else. Raises UserError."""
+    """``name`` if it can be a folder's on any system and does not lead elsewhere. Raises UserError."""
     if why := wrong_name(name):
-        raise UserError(
-            f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast"
-        )
+        wrong = f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}"
+        raise UserError(f"{wrong}; write a plain name, e.g. go1_fast")
     return name
 
 
 def wrong_name(name: str) -> str:
-    """Why no folder may be called so, or ''."""
-    why = next((f"{each!r} is in it" for each in name if each in '/\\:*?"<>|' or not each.isprintable()), "")
-    if name.startswith(("-", "~")) or (name and not name.strip(". ")):
-        why = "it begins with - or ~, or is made of dots"
+    """Why no folder can have this name, or ''."""
     if (size := len(name.encode(errors="replace"))) > MOST_LETTERS:
-        why = f"it has {size} bytes, more than {MOST_LETTERS}"
-    return why
+        return f"it has {size} bytes, more than {MOST_LETTERS}"
+    if name.startswith(("-", "~")) or (name and not name.strip(". ")):
+        return "it begins with - or ~, or is made of dots"
+    return next((f"{each!r} is in it" for each in name if each in '/\\:*?"<>|' or not each.isprintable()), "")
 
 
 def typed(path: str) -> Path:
-    """A path as a user typed it, with ~ replaced; it need not be there. Raises UserError for one that no file can have."""
+    """A path that a user typed, with ~ replaced; it need not exist. Raises UserError for one that no file can have."""
     try:
         found = Path(path).expanduser()
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             found.stat()
-    # too long, a link to itself; a null character; ~ of an unknown user
-    except (OSError, ValueError, RuntimeError) as error:
-        raise UserError(f"'{path[:60]}' is no path here: {getattr(error, 'strerror', None) or error}") from None
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # too long, a link to itself; a null character; an unknown ~user
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"'{path[:200]}' is no path here: {why}") from None
     return found
 
 
 def check_folder(folder: Path) -> Path:
-    """A run or an export, which may be a stranger's, if it holds files and folders, and links that stay in it. Raises UserError.
+    """A run or an export, perhaps a stranger's. Raises UserError unless it holds files, folders and inner links alone.
 
-    What a link leads to would be read, or written over, in place of a file; a pipe would be waited for.
+    A link out of it would let another file be read or overwritten; reading a pipe would never end.
     """
     home = folder.resolve()
     for place, folders, files in os.walk(home):
@@ -134,23 +129,22 @@ def check_folder(folder: Path) -> Path:
             elif not stat.S_ISLNK(kind) and not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
                 why = "a pipe, a socket or a device"
             if why:
-                raise UserError(
-                    f"{shown(folder)}: {path.relative_to(home)} is {why}: delete it; a run or an export holds files alone"
-                )
+                wrong = f"{shown(folder)}: {path.relative_to(home)} is {why}"
+                raise UserError(f"{wrong}: delete it; a run or an export holds files alone")
     return folder
 
 
 def finish_moving(folder: Path) -> None:
-    """Move the files of an export that is whole to their places, where a kill came in between; an empty one leaves none there.
+    """Finish an interrupted export: move its staged files into place. An empty staged file deletes its target.
 
-    Raises UserError where the folder cannot be written to. Any number of programs may do it at once.
+    Several programs may do this at once. Raises UserError if the folder cannot be written to.
     """
     staged = folder / STAGED
     try:
         if not staged.is_dir() or staged.is_symlink():
             return
         for file in sorted(staged.iterdir(), key=lambda file: (file.suffix == ".yaml", file.name)):
-            with suppress(FileNotFoundError):  # somebody else has just moved it
+            with suppress(FileNotFoundError):  # another program has just moved it
                 if file.stat().st_size:
                     os.replace(file, folder / file.name)
                 else:
@@ -159,43 +153,13 @@ def finish_moving(folder: Path) -> None:
         with suppress(FileNotFoundError):
             staged.rmdir()
     except OSError as error:
-        raise UserError(
-            f"{folder}: a newer export is on its way into it and cannot be finished: {error.strerror or error}"
-        ) from None
-
-
-def flush(path: Path) -> None:
-    """Have a file, or a folder's list of files, on the disk itself, where a power cut does not reach it."""
-    opened = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)
-
-
-def sweep(folder: Path) -> None:
-    """Remove what programs that were killed left half written in ``folder``: ``.NAME.PID.tmp`` of a process that is gone."""
-    for path in folder.glob(".*.tmp"):
-        name = re.fullmatch(r"\.(export|.+\.(?:pt|yaml))\.(\d{1,9})\.tmp", path.name)
-        if name and not _lives(int(name[2])):
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink(
-                missing_ok=True
-            )
-
-
-def _lives(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # it is another user's
-        return True
-    return True
+        why = error.strerror or error
+        raise UserError(f"{folder}: a newer export is on its way into it and cannot be finished: {why}") from None
 
 
 def read_arrays(file: Path) -> dict[str, Any]:
-    """What the .npz ``file`` holds. Raises ValueError for a file that is missing, damaged or something else. No code runs."""
-    import numpy as np  # here alone: the command line shares this file
+    """The arrays in the .npz ``file``. Runs no code from it. Raises ValueError if it is missing or damaged."""
+    import numpy as np  # not at the top: programs start without it
 
     try:
         with zipfile.ZipFile(file) if zipfile.is_zipfile(file) else nullcontext() as parts:
@@ -205,7 +169,7 @@ def read_arrays(file: Path) -> dict[str, Any]:
             return dict(archive)
     except TypeError:
         raise ValueError("it is one array, no archive of them") from None
-    except Exception as error:  # numpy's, zipfile's and zlib's, by how it is broken
+    except Exception as error:  # numpy's, zipfile's or zlib's
         raise ValueError(" ".join(str(error).split())[:200]) from None
 
 
@@ -215,9 +179,5 @@ def digest(file: Path) -> str:
 
 
 def file_of(cls: type) -> Path | None:
-    """The file with the body of ``cls``, if it is a config's."""
+    """The file in which the config class ``cls`` is written, if it is known."""
     return _FILES.get(cls)
-
-
-def _folder(cls: type) -> Path | None:
-    return _FILES[cls].parent if cls in _FILES else None

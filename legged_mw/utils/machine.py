@@ -1,6 +1,6 @@
-"""What this process may use of the machine it runs on: cores, memory, and what MuJoCo may draw through.
+"""The cores and the memory that this process may use, and the library with which MuJoCo draws.
 
-The last is settled before mujoco is imported, which reads it then.
+MuJoCo reads MUJOCO_GL when it is imported. So the library is chosen before that.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ _OFF = ("disable", "disabled", "off", "false", "0")
 
 
 def usable_cores() -> int:
-    """CPU cores of this process: those it may run on, shared with the other processes that torchrun started here."""
+    """CPU cores of this process: those that it may run on, divided by the processes that torchrun started here."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def settle() -> None:
-    """All that stays is made: garbage that nobody collected while the program started is never looked through again."""
+    """Turn garbage collection on after the start. The objects made so far stay, and are never searched again."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()
 
 
 def free_memory(device: str = "cpu") -> float:
-    """Bytes that a process may still take on ``device``; infinite where nobody says."""
+    """Free bytes of ``device``; infinite if the system does not say."""
     if device != "cpu":
-        import torch  # here alone: legged_mw.deploy runs where it is not installed
+        import torch  # not at the top: legged_mw.deploy runs without it
 
         return float(torch.cuda.mem_get_info(device)[0])
     lines = _read("/proc/meminfo").splitlines()
     free = [1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # of a container
-    # of files; given back when asked for
+    limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # of the container
+    # the cache of files in the container's use: the system frees it on demand
     cached = re.search(r"^inactive_file (\d+)$", _read("/sys/fs/cgroup/memory.stat"), re.MULTILINE)
     if limit.isdigit() and used.isdigit():
         free.append(float(limit) - float(used) + float(cached[1] if cached else 0))
@@ -51,13 +51,12 @@ def free_memory(device: str = "cpu") -> float:
 
 
 def require_memory(need: float, device: str, what: str, instead: str) -> None:
-    """Refuse ``what`` takes at least ``need`` bytes before it is allocated, if ``device`` has less. Raises UserError."""
+    """Raise UserError if ``device`` has less than the ``need`` bytes that ``what`` takes; ``instead`` is the advice."""
     free = free_memory(device)
     if need > free:
         where = "this machine" if device == "cpu" else device
-        raise UserError(
-            f"{what} needs {in_bytes(need)} of memory at least, and {where} has {in_bytes(free)} free: {instead}"
-        )
+        lacks = f"{what} needs {in_bytes(need)} of memory at least, and {where} has {in_bytes(free)} free"
+        raise UserError(f"{lacks}: {instead}")
 
 
 def in_bytes(count: float) -> str:
@@ -74,12 +73,12 @@ def _read(path: str) -> str:
 
 
 def has_display() -> bool:
-    """Whether a window could open here. Linux needs an X or Wayland display; other systems have one."""
+    """Whether a window can open here. Linux needs an X or Wayland display; other systems have one."""
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def gl_fault(name: str) -> str:
-    """Why MuJoCo cannot be imported with this MUJOCO_GL, and the remedy; "" if it can."""
+    """Why MuJoCo cannot be imported with this value of MUJOCO_GL, and the remedy; "" if it can."""
     name = name.lower().strip()
     if name in _WITHOUT_SCREEN and sys.platform == "linux":
         library, package = _WITHOUT_SCREEN[name]
@@ -93,23 +92,21 @@ def gl_fault(name: str) -> str:
 
 
 def choose_renderer() -> str:
-    """Let MuJoCo draw without a screen where it can: sets MUJOCO_GL. Returns a line if what the user set does not work.
+    """Set MUJOCO_GL so that MuJoCo can draw without a screen. Returns a warning if the user's own value does not work.
 
-    MuJoCo fails at its import, in training too, where MUJOCO_GL names what is not there.
+    With a wrong value the import of MuJoCo fails, in a training too.
     """
     if sys.platform != "linux":
         return ""
-    asked = os.environ.get("MUJOCO_GL")
-    fault = gl_fault(asked) if asked else ""
-    if not fault and (asked is not None or has_display()):
+    given = os.environ.get("MUJOCO_GL")
+    fault = gl_fault(given) if given else ""
+    if not fault and (given is not None or has_display()):
         return ""
-    works = next((name for name in _WITHOUT_SCREEN if name != asked and not gl_fault(name)), None)
+    works = next((name for name in _WITHOUT_SCREEN if name != given and not gl_fault(name)), None)
     if works:
         os.environ["MUJOCO_GL"] = works
     elif fault:
         os.environ["MUJOCO_GL"] = "glfw" if has_display() else "disable"
-    return (
-        f"MUJOCO_GL={asked} does not work here: {fault}; going on with MUJOCO_GL={os.environ['MUJOCO_GL']}"
-        if fault
-        else ""
-    )
+    if not fault:
+        return ""
+    return f"MUJOCO_GL={given} does not work here: {fault}; going on with MUJOCO_GL={os.environ['MUJOCO_GL']}"

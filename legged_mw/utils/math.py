@@ -1,4 +1,4 @@
-"""Batched rotations and masked writes, free of host reads. Quaternions are (w, x, y, z), unit, body to world."""
+"""Batched rotations and masked writes without host reads. Quaternions are (w, x, y, z), unit, body to world."""
 
 from __future__ import annotations
 
@@ -22,18 +22,6 @@ def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     return torch.addcmul(v, w, t, value=-2.0).add_(torch.linalg.cross(u, t), alpha=2.0)
 
 
-def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """The attitude (..., 4) that turns by ``b`` first, then by ``a``."""
-    w, u, s, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    return torch.cat([w * s - (u * v).sum(dim=-1, keepdim=True), w * v + s * u + torch.linalg.cross(u, v)], dim=-1)
-
-
-def rotation_quat(v: Tensor) -> Tensor:
-    """The attitude (..., 4) that turns about ``v`` (..., 3) by its length [rad]."""
-    half = v.norm(dim=-1, keepdim=True) / 2.0
-    return torch.cat([torch.cos(half), v * (0.5 * torch.sinc(half / torch.pi))], dim=-1)
-
-
 def yaw_of(q: Tensor) -> Tensor:
     """Heading of the body's x axis in the world's plane [rad] (...,) from the attitude ``q`` (..., 4)."""
     w, x, y, z = q.unbind(dim=-1)
@@ -55,29 +43,16 @@ def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
 
 
 def maybe_any(mask: Tensor) -> bool:
-    """False if ``mask`` is true nowhere. A GPU is not asked, nor is anything of a step that is traced: there the answer is True."""
+    """False if ``mask`` is all false on a CPU. On a GPU and in a traced step always True, so that nothing is read."""
     return mask.device.type != "cpu" or tracing() or bool(mask.any())
 
 
-def alike(expected: Tensor, value: Tensor, close: float, strays: float) -> bool:
-    """Equal to ``close``, relative and absolute, but for a share of ``strays``; fewer than 100 values each to a hundredth.
-
-    Reads the device.
-    """
-    few = value.numel() < 100
-    if few:
-        close = max(close, 0.01)
-    floats = value.is_floating_point()
-    other = ~torch.isclose(expected, value, rtol=close, atol=close, equal_nan=True) if floats else expected != value
-    return int(other.sum()) <= (0 if few else 1 + strays * value.numel())
-
-
 def spread(values: Tensor, count: int) -> Tensor:
-    """Values (M, ...) of M worlds for ``count`` worlds, each that of the nearest."""
+    """Stretch or thin out values (M, ...) of M worlds to ``count`` worlds, in order."""
     return values[torch.arange(count, device=values.device) * len(values) // count]
 
 
 def columns(num_rows: int, device: str, **widths: int) -> tuple[Tensor, dict[str, Tensor]]:
-    """One float matrix of zeros and a named view (N, width) of each span of its columns: cleared together, used apart."""
+    """A float matrix of zeros, to clear all columns at once, and a view (N, width) of each named span of columns."""
     matrix = torch.zeros(num_rows, sum(widths.values()), device=device)
     return matrix, dict(zip(widths, matrix.split(list(widths.values()), dim=1), strict=True))

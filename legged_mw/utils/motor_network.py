@@ -1,4 +1,4 @@
-"""A motor as a small network of numbers: from how far a joint is off its target and how fast it turns, lately, to its torque.
+"""A motor as a small neural network: from a joint's recent position errors and speeds to its torque.
 
 The same network serves each joint. It is read from an .npz without running code; envs/motors.py and deploy/contract.py evaluate it.
 """
@@ -18,21 +18,22 @@ from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[Any]  # float32
 ACTIVATIONS = ("elu", "relu", "softsign", "tanh")
+DC_RESISTANCE, DC_CONSTANT, DC_STIFFNESS, DC_DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 _RECURRENT = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _SCALES = ("error_scale", "speed_scale", "torque_scale")
 
 
 @dataclass(frozen=True)
 class MotorNetwork:
-    """LSTM layers, if there are any, then linear layers with an activation between them; weights are (out, in), as torch has them.
+    """LSTM layers, if any, then linear layers with an activation between them. Weights are (out, in), as in torch.
 
-    Input of a joint: error_scale * (target - angle) [rad] of each of ``frames``, then speed_scale * speed [rad/s] of each; or in turns,
-    with ``in_turns``. ``frames`` are ages in simulation steps, 0 is now. Output: torque [N m], times torque_scale.
+    Input of a joint: error_scale * (target - angle) [rad] at each of ``frames``, then speed_scale * speed [rad/s] at
+    each; with ``in_turns`` error and speed alternate. ``frames`` are ages in simulation steps, 0 is now. Output: torque
+    [N m], times torque_scale.
     """
 
-    # a layer: (4 H, in), (4 H, H), (4 H,), (4 H,); gates i, f, g, o
-    recurrent: list[tuple[Floats, Floats, Floats, Floats]]
-    linear: list[tuple[Floats, Floats]]  # a layer: (out, in), (out,)
+    recurrent: list[tuple[Floats, Floats, Floats, Floats]]  # (4 H, in), (4 H, H), (4 H,), (4 H,); gates i, f, g, o
+    linear: list[tuple[Floats, Floats]]  # (out, in), (out,)
     activation: str
     frames: tuple[int, ...]
     in_turns: bool = False
@@ -46,35 +47,24 @@ class MotorNetwork:
         return [layer[1].shape[1] for layer in self.recurrent]
 
     def to_arrays(self) -> dict[str, Any]:
-        """What the .npz holds."""
-        layers = {
-            f"{name}_l{i}": value
-            for i, layer in enumerate(self.recurrent)
-            for name, value in zip(_RECURRENT, layer, strict=True)
-        }
+        """The arrays of its .npz."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ("activation", "in_turns", *_SCALES)}
+        for i, layer in enumerate(self.recurrent):
+            arrays |= {f"{name}_l{i}": value for name, value in zip(_RECURRENT, layer, strict=True)}
         for i, (weight, bias) in enumerate(self.linear):
-            layers |= {f"weight{i}": weight, f"bias{i}": bias}
-        scales = {name: getattr(self, name) for name in _SCALES}
-        return {
-            **layers,
-            "activation": self.activation,
-            "frames": np.array(self.frames),
-            "in_turns": self.in_turns,
-            **scales,
-        }
+            arrays |= {f"weight{i}": weight, f"bias{i}": bias}
+        return {**arrays, "frames": np.array(self.frames)}
 
 
 def read_network(file: Path) -> MotorNetwork:
-    """The network in ``file``. Raises UserError for what is none, in one line."""
+    """The network in ``file``. Raises UserError if it holds none."""
     try:
         arrays = read_arrays(file)
     except ValueError:
         arrays = {}
     if not any(name.startswith("weight") for name in arrays):  # a torchscript file is a zip too
-        raise UserError(
-            f"{file.name} is no .npz of a network's arrays; "
-            f"a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
-        )
+        remedy = f"a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
+        raise UserError(f"{file.name} is no .npz of a network's arrays; {remedy}")
     try:
         return _read(arrays)
     except (KeyError, ValueError, TypeError, OverflowError) as error:
@@ -84,22 +74,18 @@ def read_network(file: Path) -> MotorNetwork:
 def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
     frames = tuple(int(age) for age in np.ravel(arrays.get("frames", 0)))
     if not frames or list(frames) != sorted({*frames}) or frames[0] < 0 or frames[-1] > 10_000:
-        raise ValueError(
-            f"frames is {list(frames)[:99]}; they must be ages in simulation steps, the newest first, 10000 at most"
-        )
+        must = "they must be ages in simulation steps, the newest first, 10000 at most"
+        raise ValueError(f"frames is {list(frames)[:99]}; {must}")
     activation = str(arrays.get("activation", "elu"))
     if activation not in ACTIVATIONS:
         raise ValueError(unknown("activation", activation, ACTIVATIONS, "motor networks"))
     width, recurrent, linear = 2 * len(frames), [], []
     while f"weight_ih_l{len(recurrent)}" in arrays:
-        units = _take(arrays, f"weight_hh_l{len(recurrent)}", -1, -1).shape[1]
+        layer = f"l{len(recurrent)}"
+        units = _take(arrays, f"weight_hh_{layer}", -1, -1).shape[1]
         shapes = ((4 * units, width), (4 * units, units), (4 * units,), (4 * units,))
-        recurrent.append(
-            tuple(
-                _take(arrays, f"{name}_l{len(recurrent)}", *shape)
-                for name, shape in zip(_RECURRENT, shapes, strict=True)
-            )
-        )
+        named = zip(_RECURRENT, shapes, strict=True)
+        recurrent.append(tuple(_take(arrays, f"{name}_{layer}", *shape) for name, shape in named))
         width = units
     while f"weight{len(linear)}" in arrays:
         weight = _take(arrays, f"weight{len(linear)}", -1, width)
@@ -113,16 +99,15 @@ def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
 
 
 def _take(arrays: Mapping[str, Any], name: str, *shape: int) -> Floats:
-    """The array ``name`` of ``shape``, in which -1 is any size."""
+    """The array ``name``, which must have this ``shape``; -1 is any size."""
     if name not in arrays:
         raise ValueError(f"array '{name}' is missing")
     value = np.asarray(arrays[name], dtype=np.float32)
     same = value.ndim == len(shape)
     wanted = tuple(own if size < 0 else size for own, size in zip(value.shape, shape, strict=True)) if same else shape
     if value.shape != wanted:
-        raise ValueError(
-            f"array '{name}' has shape {value.shape}, it must be {wanted}: (out, in), in from the layer before or the frames"
-        )
+        why = "(out, in), in from the layer before or the frames"
+        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {wanted}: {why}")
     if not np.isfinite(value).all():
         raise ValueError(f"array '{name}' has values that are not finite")
     return value

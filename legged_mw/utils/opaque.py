@@ -1,6 +1,6 @@
-"""What the core knows of legged_mw/fast, the package that makes a step faster: which calls it may not look into, and its modules.
+"""The core's one door to legged_mw/fast, the package that makes a step faster.
 
-The core runs without that package. So it imports nothing from there: it asks here, and None means that the package is not there.
+The core runs without that package and imports nothing from it: ``fast`` loads its modules by name, if they exist.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import legged_mw
 P = ParamSpec("P")
 R = TypeVar("R")
 
-traces: list[Any] = []  # those that fast/trace.py takes at the moment, the innermost last
+traces: list[Any] = []  # running traces of fast/trace.py, the innermost last
 
 
 def tracing() -> bool:
-    """Whether a trace is taken at the moment."""
+    """Whether a trace is running."""
     return bool(traces)
 
 
 def not_traced(method: Callable[P, R]) -> Callable[P, R]:
-    """Of a method that a trace is not to look into: it is called anew each time."""
+    """Decorate a method that a trace must not look into: the traced step calls it every time."""
 
     @wraps(method)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
@@ -36,8 +36,8 @@ def not_traced(method: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def fast(module: str) -> Any:
-    """That module of legged_mw.fast, or None without the package. An error inside of the module is raised."""
-    # in this project, wherever another is installed
+    """The module legged_mw.fast.``module``, or None without the package. Errors inside of the module are raised."""
+    # look in this project alone: another legged_mw may be installed
     package = PathFinder.find_spec("legged_mw.fast", legged_mw.__path__)
     if package is None or package.origin is None:  # no folder, or one without source files
         return None

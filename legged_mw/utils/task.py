@@ -1,14 +1,13 @@
-"""Finding a task: a name in ``configs/``, or the path of a config file anywhere; and its two configs as one."""
+"""Find a task, by its name in ``configs/`` or by the path of its config file, and hold its two configs as one."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
 import os
-import shlex
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
@@ -17,30 +16,29 @@ from typing import Any, NamedTuple
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import UserError, in_short, shown, unknown, users_fault
-from legged_mw.utils.files import file_of, find_file, typed
-from legged_mw.utils.renamed import with_new_names
+from legged_mw.utils.files import file_of, typed
 
 _ENDS = "must end with TASK = Task(Env, Cfg, CfgPPO)"
-PRESETS = "base"  # configs/base.py: what tasks extend, no task
+PRESETS = "base"  # configs/base.py: no task, but presets that tasks extend
 ROBOT_FILES = (".xml", ".mjcf", ".urdf")
 _SHIPPED = (ROOT / "configs").resolve()
-_packages: dict[tuple[Path, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its modules, imported once
-_beside: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> the modules beside it, likewise
+_packages: dict[tuple[Path, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its imported modules
+_beside: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> the imported modules beside it
 
 
 class Task(NamedTuple):
-    """What the last line of a config file names: three classes, and how its policies are graded."""
+    """The last line of a config file: three classes, and the exam of the policies."""
 
     env: type[Any]  # the environment, a RobotTask
     cfg: type[Any]  # its config
     train: type[Any]  # the learner's config
-    exam: str | None = None  # a kind of exam, "" for none; None: the one that the environment's class names
+    exam: str | None = None  # a kind of exam, "" for none; None: that of the environment's class
 
 
 class LoadedTask:
     """A task with fresh instances of its configs: ``cfg`` for the environment, ``train`` for the learner.
 
-    The sections of both share one name space: ``set`` and ``update`` take a path or a mapping over all of them.
+    Both share one name space of sections: ``set`` takes a path, ``update`` a mapping, into either of them.
     """
 
     def __init__(self, name: str, path: Path, task: Task, about: str = "") -> None:
@@ -48,79 +46,36 @@ class LoadedTask:
         self.about = about  # the config file's first line
         self.exam: str = getattr(task.env, "exam", "") if task.exam is None else task.exam
         self.cfg, self.train = task.cfg(), task.train()
-        self.cfg._folder = str(path.resolve().parent)  # where files that flags name are looked for: utils/files.py
+        self.cfg._folder = str(path.resolve().parent)  # for find_file of utils/files.py
 
     def set(self, path: str, value: Any, where: str = "--set") -> None:
-        """Override one field by its dotted path; text is parsed by the field's type."""
+        """Override the field at a dotted path. Text is read by the field's type."""
         section = path.split(".")[0]
         self._owner(section, where).set(path, value, where=where)
 
     def update(self, values: Mapping[str, Any], where: str) -> None:
-        """Override fields from a nested mapping over the sections of both configs; all of them or, on an error, none."""
-        parts: dict[int, dict[str, Any]] = {id(self.cfg): {}, id(self.train): {}}
+        """Override all fields in the nested ``values``, of both configs, or none if one is wrong."""
+        parts: dict[Config, dict[str, Any]] = {self.cfg: {}, self.train: {}}
         for section, fields in values.items():
             if section != "task":
-                parts[id(self._owner(section, where))][section] = fields
+                parts[self._owner(section, where)][section] = fields
         before = self.cfg.to_dict()
-        self.cfg.update(parts[id(self.cfg)], where=where)
+        self.cfg.update(parts[self.cfg], where=where)
         try:
-            self.train.update(parts[id(self.train)], where=where)
+            self.train.update(parts[self.train], where=where)
         except ConfigError:
             self.cfg.update(before, where=where)
             raise
 
-    def update_from_run(self, saved: Mapping[str, Any], where: str) -> list[str]:
-        """Take over the ``config.yaml`` of a run; it must be one of this task. Its old names are read as the new ones.
-
-        A learner's section that the file lacks, since it is older than the section, is what it was then: the base class's,
-        not the task's of today. Returns the names of such sections.
-        """
-        saved = self._with_own_file(with_new_names(saved))
-        theirs = str(saved.get("task", self.name))
-        if Path(theirs).stem != self.name:
-            what = f"say --task {theirs}" if of_project(theirs) else f"that is {somebodys(theirs)}"
-            raise ConfigError(f"{where} is of task {theirs[:200]!r}, not '{self.name}'; {what}")
-        base = next(
-            kind for kind in reversed(type(self.train).__mro__) if issubclass(kind, Config) and kind is not Config
-        )()
-        older = {name: value for name, value in base.to_dict().items() if name not in saved and isinstance(value, dict)}
-        self.update({**saved, **older}, where)
-        return list(older)
-
-    def _with_own_file(self, saved: Mapping[str, Any]) -> Mapping[str, Any]:
-        """``saved`` without an absolute ``asset.file`` that is the task's own: runs once stored the path of their machine."""
-        asset = saved.get("asset")
-        file = Path(str(asset.get("file", ""))) if isinstance(asset, Mapping) else Path()
-        if asset is None or not file.is_absolute() or file.name != Path(self.cfg.asset.file).name:
-            return saved
-        if file.exists() and not file.samefile(find_file(self.cfg, "asset.file")):
-            return saved
-        return {**saved, "asset": {**asset, "file": self.cfg.asset.file}}
-
     def changes_since(self, before: LoadedTask) -> dict[str, tuple[Any, Any]]:
-        """Dotted path -> (value in ``before``, value now) of every field that differs; ``before`` is a copy of this task."""
+        """Dotted path -> (value in ``before``, value now) of all fields that differ from a copy of this task."""
         differences = [*before.cfg.diff(self.cfg), *before.train.diff(self.train)]
         return {path: (then, now) for path, then, now in differences}
 
-    def fit_cpu(self, cores: int) -> None:
-        """Take over what the section ``cpu`` says, for ``cores`` cores."""
-        train, few = self.train, self.train.cpu
-        self.cfg.env.num_envs = min(self.cfg.env.num_envs, few.envs_per_core * cores)
-        train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
-        train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = (
-            few.num_learning_epochs,
-            few.num_mini_batches,
-        )
-        train.algorithm.desired_kl = few.desired_kl
-        train.actor.hidden_dims = train.critic.hidden_dims = few.hidden_dims
-        train.actor.rnn_hidden_dim = train.critic.rnn_hidden_dim = few.rnn_hidden_dim
-        for path, value in few.overrides.items():
-            self.set(path, value, where="cpu.overrides")
-
     def to_dict(self) -> dict[str, Any]:
-        """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds.
+        """Both configs and the task's name as one mapping, for ``config.yaml`` in a run's folder.
 
-        Of a file outside of configs/ that is the path from the current folder, which has logs/: both may move together.
+        A file outside of configs/ is named by its path from the current folder: the file and logs/ can move together.
         """
         name, here, file = self.name, Path.cwd().resolve(), self.path.resolve()
         if not self.ships:
@@ -129,13 +84,13 @@ class LoadedTask:
         return {"task": name, **self.cfg.to_dict(), **self.train.to_dict()}
 
     def file_called(self, name: str) -> Path | None:
-        """The file of that ``name`` among the task's own and those of the configs that it extends: they have been run."""
+        """The file of this ``name`` that is the task's own, or of a config that it extends."""
         kinds = (*type(self.cfg).__mro__, *type(self.train).__mro__)
         return next((file for file in (self.path, *map(file_of, kinds)) if file and file.name == name), None)
 
     @property
     def ships(self) -> bool:
-        """Whether the file is in configs/, so that ``--task`` knows its bare name."""
+        """Whether the file is in configs/, so that ``--task`` takes its bare name."""
         return self.path.parent.resolve() == _SHIPPED
 
     def _owner(self, section: str, where: str) -> Config:
@@ -145,56 +100,27 @@ class LoadedTask:
         return sections[section]
 
 
-def of_project(stored: str) -> str:
-    """``--task`` for the task that a run's config names, if it is this project's; "" for any other file, which no run may start.
-
-    The project's are the names in configs/, and files that really lie in configs/ or examples/ of ``ROOT``, the package or the clone.
-    """
-    if Path(stored).suffix != ".py":
-        return stored  # a name; there is none outside of configs/
-    folders = [(ROOT / name).resolve() for name in ("configs", "examples")]
-    with suppress(OSError, ValueError, RuntimeError):  # a name that no file can have, a link to itself
-        for file in ((place / stored).resolve() for place in (Path.cwd(), ROOT)):
-            if file.is_file() and file.parent in folders:
-                return str(file)
-    return ""
-
-
-def somebodys(stored: str) -> str:
-    """What a task's file that is not ``of_project`` is, and the flag that runs it."""
-    return f"somebody's code, which no run starts by itself: read it, then say --task {shlex.quote(stored[:200])}"
-
-
 def task_names() -> list[str]:
-    """Names that ``--task`` knows without a path."""
+    """All tasks in configs/."""
     names = [path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_")]
     return sorted(name for name in names if name != PRESETS)
 
 
-def list_tasks() -> str:
-    """A line a task: its name and the first line of its file."""
-    return "\n".join(f"{name:<16} {load_task(name).about}" for name in task_names())
-
-
 def load_task(name: str, say: bool = False) -> LoadedTask:
-    """The task called ``name`` in ``configs/``, or that of the config file at that path, which is printed before it runs if ``say``.
+    """The task ``name`` in ``configs/``, or in the config file at that path; ``say``: print that path before it runs.
 
-    The file may import its neighbours. A relative ``asset.file`` is looked for beside the file that wrote it, then in the repository.
+    The file may import its neighbours. A relative ``asset.file`` is looked for as ``find_file`` says.
     """
-    path = typed(name)
+    path, known = typed(name), task_names()
     if path.suffix in ROBOT_FILES:
-        raise ConfigError(
-            f"{name} is a robot, not a task; make a task for it: python -m legged_mw.robot {name} --new NAME"
-        )
+        remedy = f"make a task for it: python -m legged_mw.robot {name} --new NAME"
+        raise ConfigError(f"{name} is a robot, not a task; {remedy}")
+    if path.suffix != ".py" and name not in known:
+        if path.is_file():
+            kinds = f"a task's config file (.py) nor a robot ({', '.join(ROBOT_FILES)})"
+            raise ConfigError(f"{name} is neither {kinds}")
+        raise ConfigError(f"{unknown('task', name, known, 'configs/')}; or give the path of a config file (.py)")
     if path.suffix != ".py":
-        known = task_names()
-        if name not in known and path.is_file():
-            raise ConfigError(
-                f"{name} is neither a task's config file (.py) nor a robot ({', '.join(ROBOT_FILES)})"
-                + ("; unzip it, and name the .xml that is in it" if path.suffix in (".mjz", ".zip") else "")
-            )
-        if name not in known:
-            raise ConfigError(f"{unknown('task', name, known, 'configs/')}; or give the path of a config file (.py)")
         path = ROOT / "configs" / f"{name}.py"
     if not path.is_file():
         raise ConfigError(f"no config file at {path.absolute()}")
@@ -206,43 +132,30 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
         raise
     except SyntaxError as error:
         line = f":{error.lineno}" if error.lineno else ""
-        raise ConfigError(
-            f"{shown(Path(error.filename or path))}{line}: {error.msg}: {(error.text or '').strip()[:100]}"
-        ) from error
+        where = f"{shown(Path(error.filename or path))}{line}"
+        raise ConfigError(f"{where}: {error.msg}: {(error.text or '').strip()[:100]}") from error
     except (Exception, SystemExit) as error:
-        ends = "" if isinstance(error, ImportError) else f"; {shown(path)} {_ENDS}"
-        raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}{ends}") from error
+        remedy = "" if isinstance(error, ImportError) else f"; {shown(path)} {_ENDS}"
+        raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}{remedy}") from error
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
         raise ConfigError(f"{path} {_ENDS}; its TASK is {task!r:.100}")
-    _check_task(task, path)
+    for part, attribute, wanted in (
+        ("env", "observation_rows", "an environment, as LeggedRobot is"),
+        ("cfg", "env", "an environment's config, as LeggedRobotCfg is"),
+        ("train", "runner", "a learner's, as LeggedRobotCfgPPO is"),
+    ):
+        kind = getattr(task, part)
+        if not isinstance(kind, type) or not hasattr(kind, attribute):
+            raise ConfigError(f"{path}: TASK: {part} is {kind!r:.100}; it must be a class: {wanted}")
+    if not isinstance(task.exam, str | None):
+        raise ConfigError(f"{path}: TASK: exam is {task.exam!r:.100}; it must be the name of an exam, or None")
     return LoadedTask(path.stem, path, task, about=(module.__doc__ or "").partition("\n")[0])
 
 
-def _check_task(task: Task, path: Path) -> None:
-    """Three classes of the kinds that are expected, and an exam's name."""
-    for name, kind, wanted, has in (
-        ("env", task.env, "an environment, as LeggedRobot is", lambda kind: hasattr(kind, "observation_rows")),
-        (
-            "cfg",
-            task.cfg,
-            "an environment's config, as LeggedRobotCfg is",
-            lambda kind: issubclass(kind, Config) and hasattr(kind, "env"),
-        ),
-        (
-            "train",
-            task.train,
-            "a learner's, as LeggedRobotCfgPPO is",
-            lambda kind: issubclass(kind, Config) and hasattr(kind, "runner"),
-        ),
-    ):
-        if not isinstance(kind, type) or not has(kind):
-            raise ConfigError(f"{path}: TASK: {name} is {kind!r:.100}; it must be a class: {wanted}")
-    if not isinstance(task.exam, str | None):
-        raise ConfigError(f"{path}: TASK: exam is {task.exam!r:.100}; it must be the name of an exam, or None")
-
-
-# ---- importing a task's file: its neighbours by their names, `configs` as one package; `sys.path` is as it was before ----------
+# ---- importing a task's file ---------------------------------------------------------------------------------------
+# A file may import its neighbours by their names, and configs/ as the package `configs`. Two tasks in different folders
+# may have neighbours of the same name, so each folder keeps its own modules. `sys.path` is unchanged afterwards.
 
 
 def import_task(path: Path) -> ModuleType:
@@ -252,15 +165,17 @@ def import_task(path: Path) -> ModuleType:
     places = (beside, _SHIPPED) if beside.is_dir() and beside != _SHIPPED else (_SHIPPED,)
     have = [Path(place).resolve() for place in getattr(sys.modules.get("configs"), "__path__", ())]
     names = {entry.stem for entry in folder.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").is_file()}
+    names = {name for name in names if _may_be_neighbour(name, folder)}
     package = set() if have == [*places] else {"configs"}
-    names = {name for name in names if _may_mean(name, folder)}
-    mine, beside_it = _packages.setdefault(places, {}), _beside.setdefault(folder, {})
-    with _named(package, mine, places), _named(names, beside_it):
+    with (
+        _modules(package, _packages.setdefault(places, {}), places),
+        _modules(names, _beside.setdefault(folder, {})),
+    ):
         if "configs" not in sys.modules:
             sys.modules["configs"] = ModuleType("configs")
             sys.modules["configs"].__path__ = [str(place) for place in places]
         sys.path.insert(0, str(folder))
-        importlib.invalidate_caches()  # a file that was written a moment ago
+        importlib.invalidate_caches()  # the file may be a moment old
         try:
             return importlib.import_module(f"configs.{path.stem}") if folder == _SHIPPED else _run(path)
         finally:
@@ -277,8 +192,8 @@ def _run(path: Path) -> ModuleType:
     return module
 
 
-def _may_mean(name: str, folder: Path) -> bool:
-    """Whether ``name`` may be that of a neighbour in ``folder``: it is no library's, and not imported from there already."""
+def _may_be_neighbour(name: str, folder: Path) -> bool:
+    """Whether an import of ``name`` may take the file in ``folder``: no library or imported neighbour has the name."""
     if name in sys.stdlib_module_names or name in ("__main__", "legged_mw", "configs"):
         return False
     if name not in sys.modules:
@@ -288,11 +203,11 @@ def _may_mean(name: str, folder: Path) -> bool:
 
 
 @contextmanager
-def _named(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, ...] = ()) -> Iterator[None]:
-    """While a task is loaded, the modules called ``names`` are ``mine``, to which those are added that it imports.
+def _modules(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, ...] = ()) -> Iterator[None]:
+    """Inside, the imported modules called ``names`` are ``mine``; modules imported inside are added to ``mine``.
 
-    Afterwards a name is given back to what had it outside of tasks, and ``configs`` to what else on the path has it. Other names
-    stay until the next task wants them, since a config may name a class by its module.
+    Afterwards names go back to the modules that had them outside of tasks, and ``configs`` to another package of that
+    name on the path. Other names stay until the next task needs them, since a config may name a class by its module.
     """
     before = _take_out(names)
     sys.modules.update(mine)
@@ -310,7 +225,7 @@ def _named(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, ...
 
 
 def _take_out(names: set[str]) -> dict[str, ModuleType]:
-    """Remove the modules and packages ``names`` from those that are imported; returns them."""
+    """Remove the modules called ``names``, and their submodules, from the imported ones; return them."""
     return {name: sys.modules.pop(name) for name in [*sys.modules] if _top(name) in names}
 
 

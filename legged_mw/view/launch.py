@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from legged_mw.utils.commands import Command, outside, parse_command
+from legged_mw.utils.commands import Command
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.machine import has_display
@@ -17,7 +17,7 @@ from legged_mw.view import web
 from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
 from legged_mw.view.native import NativeViewer
 from legged_mw.view.recorder import Recorder
-from legged_mw.view.script import load_script
+from legged_mw.view.script import load_script, outside, parse_command
 from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
 from legged_mw.view.video import check_format, no_encoder

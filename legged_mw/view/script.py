@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from legged_mw.utils.commands import VELOCITY, Command, outside, with_units
+from legged_mw.utils.commands import VELOCITY, Command, with_units
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 from legged_mw.view.drive import NO_COMMANDS, PUSH_MAX, Pilot
@@ -128,3 +128,39 @@ def _numbers(value: Any, counts: Sequence[int], where: str, form: str) -> list[f
     if len(values) not in counts or len(good) != len(values):
         raise ConfigError(f"{where}: write {form}, not {value!r}")
     return [float(v) for v in good]
+
+
+def parse_command(text: str, table: Sequence[Command]) -> list[float]:
+    """Values (C,) from ``0.5,0,0``, in the order of the table, or ``base_height=0.3``; all others keep their default.
+
+    Raises ConfigError for an unknown name, too many numbers, or a value outside of its range.
+    """
+    names, values = [c.name for c in table], [c.default for c in table]
+    for place, item in enumerate(text.split(",")):
+        name, equals, number = item.partition("=")
+        if equals and name.strip() not in names:
+            raise ConfigError(f"--command {text}: {unknown('command', name.strip(), names, 'this task')}")
+        if not equals and place >= len(table):
+            have = f"this task has {len(table)} commands: {with_units(table) or 'none'}"
+            raise ConfigError(f"--command {text}: {place + 1} numbers, but {have}")
+        try:
+            value = float(number if equals else item)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            write = f"--command={','.join(f'{c.default:g}' for c in table)} ({with_units(table)})"
+            raise ConfigError(f"--command {text}: '{item.strip()}' is no number; write {write}")
+        values[names.index(name.strip()) if equals else place] = value
+    if wrong := outside(values, table):
+        raise ConfigError(f"--command {text}: {wrong}")
+    return values
+
+
+def outside(values: Sequence[float], table: Sequence[Command]) -> str:
+    """The first of the values (C,) outside of its trained range, in words; "" if there is none."""
+    for value, command in zip(values, table, strict=True):
+        if not command.low - 1e-9 <= value <= command.high + 1e-9:
+            unit = f" {command.unit}" if command.unit else ""
+            trained = f"[{command.low:g}, {command.high:g}]{unit}"
+            return f"{command.label} = {value:g}{unit} is outside of what was trained, {trained}"
+    return ""

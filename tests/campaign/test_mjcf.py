@@ -18,10 +18,10 @@ from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.drawing.scene import visual_model
 from legged_mw.rl.export_scene import standalone
+from legged_mw.robot.mjcf import Source, write_archive
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import read_file
 from legged_mw.utils.errors import ModelError
-from legged_mw.utils.mjcf import Source, write_archive
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"

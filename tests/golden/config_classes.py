@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from test_config import Base, Go1
-from test_config import nest as nested
 
 from golden.table import Table
 from legged_mw.utils.task import load_task
@@ -39,9 +38,6 @@ CLASSES = {
     "a method's name": "class A(Config):\n    update: int = 3",
     "_only in a section of fields": "class A(Base):\n    class env(Base.env):\n        _only = True",
     "a value of another type": "class A(Base):\n    class env(Base.env):\n        num_envs = 3.0",
-    "an old name": (
-        "from configs.go1_flat import Go1FlatCfg as B\nclass A(B):\n    class perturbation(B.perturbation):\n        enable = True"
-    ),
 }
 VALUES = {  # path -> values of a wrong type
     "env.num_envs": [3.0, True, "3.5", "many", {"a": 1}],
@@ -97,14 +93,4 @@ def table() -> Table:
     made.add("assigned: another field", lambda root: setattr(Go1().env, "num_env", 3))
     made.add("assigned: a section", lambda root: setattr(Go1(), "env", 3))
     made.add("assigned: another type", lambda root: setattr(Go1().env, "num_envs", "3"))
-    for path, value in {
-        "perturbation.enable": True,
-        "cpu.keep_probability": [0.5, 0.5, 0.5],
-        "cpu.kick_curriculum": False,
-    }.items():
-        made.add(f"old name {path}", lambda root, path=path, value=value: load_task("go1_flat").set(path, str(value)))
-        made.add(
-            f"old name {path} in a file",
-            lambda root, path=path, value=value: load_task("go1_flat").update(nested(path, value), where="a.yaml"),
-        )
     return made

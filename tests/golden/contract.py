@@ -20,9 +20,9 @@ from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.robot import QUANTITIES, Measurement
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.utils import mjcf
+from legged_mw.robot import mjcf
+from legged_mw.robot.mjcf import write_archive
 from legged_mw.utils.config import load_yaml, save_yaml
-from legged_mw.utils.mjcf import write_archive
 
 POLICIES = ROOT / "resources/policies"
 

@@ -21,6 +21,7 @@ from legged_mw.rl import export as exporting
 from legged_mw.rl.export import export
 from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.keeping import RunLock
+from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import begin_with
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml
@@ -41,7 +42,7 @@ def exports(env_class: Any = None, **patches: Any) -> Run:
     def run(root: Path) -> None:
         task = load_task("go1_flat")
         folder = root / "logs/go1_flat/run"
-        task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
+        update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
         task.env_class = env_class or task.env_class
         export(task, folder / "model_2.pt", root / "out")
 

@@ -1,7 +1,8 @@
-"""The XML of a robot: parsed once, looked at as attributes, and handed to MuJoCo as what was looked at.
+"""Read the XML of strangers' robots and scenes: parse it once, check its attributes, and give MuJoCo the checked tree.
 
-MuJoCo reads neither the file nor what that includes or attaches, but their trees, written anew: no reference, comment, encoding or
-mistake of form means one thing here and another there. What is refused is a ValueError in one line, without the file's name.
+MuJoCo does not read the file, nor files that it includes or attaches, but the text of the parsed trees. So an entity, a
+comment, an encoding or malformed XML cannot mean one thing here and another in MuJoCo. A refusal is a ValueError in one
+line, without the file's name.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -24,51 +25,50 @@ import mujoco
 import numpy as np
 
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
-DC_RESISTANCE, DC_CONSTANT, DC_STIFFNESS, DC_DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 _INSIDE = "model.xml"
-MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
-# of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
+MOST_BYTES = 64 << 20  # of one file: ten times the largest known robots with their meshes inside
+# [kg] of a body; any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
 HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3
-_ELEMENTS, _CELLS, _DEEPEST = 20_000, 1e8, 200  # with all copies; of height fields and pictures; in each other
+_ELEMENTS, _CELLS, _DEEPEST = 20_000, 1e8, 200  # with all copies; of height fields and pictures; nested
 _TOO_MUCH = (
     f"makes more than {_ELEMENTS} elements, all copies counted, or {_CELLS:g} cells of height fields and pictures"
 )
-_PLACES = 100_000  # files that it names, times folders where these may lie
-_PIECE, _LONGEST = 1 << 20, 16 << 20  # [byte] that the parser gets at a time; of one element and its attributes
-# attribute -> the most that makes sense
+_PLACES = 100_000  # files that it names, times folders where they may lie
+_PIECE, _LONGEST = 1 << 20, 16 << 20  # [byte] for the parser at a time; of one element with its attributes
+# attribute -> the largest sensible value
 _MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}
 _MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {
     "nuserdata": 1e6
 }
 _MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": WIDEST, "diaginertia": WIDEST}
-# of the model's arrays
+# arrays of the compiled model
 _SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")
 _DIRS = ("meshdir", "texturedir", "assetdir")
-_OF_URDF = ("mesh", "texture", "compiler")  # which name files that MuJoCo reads
+_OF_URDF = ("mesh", "texture", "compiler")  # elements of a URDF with files that MuJoCo reads
 _NAMES = ("name", "class", "childclass", "model", "file", "dir", *_DIRS)
 
 
 class Source:
-    """A robot's file with what it includes and attaches. Raises ValueError for what no robot needs and a reader may choke on.
+    """A robot's file with the files that it includes and attaches. Raises ValueError for things that no robot needs.
 
-    ``alone``: it names no file outside of its own folder, meshes and textures too; a vendor's meshes may lie beside that folder.
+    ``alone``: no file outside of its own folder is allowed. Otherwise meshes and textures may lie elsewhere.
     """
 
     def __init__(self, file: Path, alone: bool = False) -> None:
         self.file, self.alone = file.absolute(), alone
         self.home = os.path.realpath(self.file.parent)
         self.named: dict[str, str] = {}  # file -> the line that names it
-        self.folders: dict[str, None] = {}  # in which those may lie, in order
-        self._parts = {os.path.realpath(file): ""}  # included or attached -> its name for MuJoCo; "": being read
-        self._texts: dict[str, bytes] = {}  # the same without the folder -> what is handed over
-        self.elements, self._largest = 0, 0.0  # that are written; of the largest part, with its copies
+        self.folders: dict[str, None] = {}  # where these files may lie, in order
+        self._parts = {os.path.realpath(file): ""}  # included or attached file -> its name for MuJoCo; "": being read
+        self._texts: dict[str, bytes] = {}  # that name without the folder -> the text for MuJoCo
+        self.elements, self._largest = 0, 0.0  # elements so far; elements of the largest file, with its copies
         self.root = self._read(self.file, str(self.file.parent))
         if len(self.named) * len(self.folders) > _PLACES:
             raise ValueError(
                 f"it names {len(self.named)} files, which may lie in {len(self.folders)} folders; no robot has so many"
             )
         for name, where in self.named.items():
-            # as strippath
+            # MuJoCo may strip folders from names (strippath)
             for place in (
                 os.path.join(folder, path) for folder in self.folders for path in (name, os.path.basename(name))
             ):
@@ -76,18 +76,18 @@ class Source:
 
     @property
     def text(self) -> str:
-        """What MuJoCo is handed of the file itself: its elements, each in the line that it had."""
+        """The text for MuJoCo: the elements of the file, each in its old line."""
         return tostring(self.root, encoding="unicode")
 
     def spec(self) -> mujoco.MjSpec:
-        """What MuJoCo makes of ``root``."""
-        if self.file.suffix == ARCHIVE:  # which names nothing
+        """MuJoCo's spec of ``root``."""
+        if self.file.suffix == ARCHIVE:  # it names no other file
             return mujoco.MjSpec.from_string(self.text)
-        name = f"{self.file}.xml"  # MuJoCo goes by the ending, and warns on a line of its own where it knows none
+        name = f"{self.file}.xml"  # MuJoCo warns about endings that it does not know
         return mujoco.MjSpec.from_file(name, include={os.path.basename(name): self.text.encode(), **self._texts})
 
     def take(self, name: str, path: str, folder: str) -> str:
-        """Read what is included or attached, and return where MuJoCo finds it: in the same folder, by a name that nothing else has."""
+        """Read an included or attached file. Return its path for MuJoCo: in the same folder, under a unique name."""
         real = os.path.realpath(path)
         if not Path(real).is_relative_to(self.home):
             raise ValueError(f"it includes {name[:200]}, which lies outside of its own folder; put that file beside it")
@@ -110,7 +110,7 @@ class Source:
         return root
 
     def _size(self, element: Element) -> float:
-        """How much it makes [elements]."""
+        """How many elements MuJoCo makes of it; cells of height fields and pictures count as parts of elements."""
         size = 1.0 + (self._largest if element.tag in ("include", "attach") else 0.0)
         for sides in (("nrow", "ncol"), ("width", "height")):
             size += math.prod(max(_numbers(element.get(side, "")), default=0.0) for side in sides) * _ELEMENTS / _CELLS
@@ -120,18 +120,13 @@ class Source:
 
 
 class _Reader:
-    """Grows the tree of one file, without comments and text. Raises ValueError, with the line."""
+    """Builds the tree of one file, without comments and text. Raises ValueError with the line."""
 
     def __init__(self, source: Source, path: Path, folder: str) -> None:
-        self.source, self.path, self.folder = source, path, folder  # the last: of the model that it is or belongs to
+        self.source, self.path, self.folder = source, path, folder  # folder: of the model to which the file belongs
         self.file = "" if path == source.file else f"{path.name}: "
-        self.builder, self.parser, self.line, self.depth, self.urdf = (
-            TreeBuilder(),
-            expat.ParserCreate("utf-8"),
-            1,
-            0,
-            False,
-        )
+        self.builder, self.parser = TreeBuilder(), expat.ParserCreate("utf-8")
+        self.line, self.depth, self.urdf = 1, 0, False
         self.parser.StartElementHandler, self.parser.EndElementHandler = self._start, self._end
         self.parser.StartDoctypeDeclHandler = self._refuse_doctype
         source.folders |= dict.fromkeys((folder, str(path.parent)))
@@ -139,7 +134,7 @@ class _Reader:
         try:
             for start in range(0, len(content), _PIECE):
                 self.parser.Parse(content[start : start + _PIECE])
-                # an element is looked at from its beginning with each piece
+                # the parser scans an unfinished element again with each piece
                 if start - self.parser.CurrentByteIndex > _LONGEST:
                     raise ValueError(f"{self.where}an element has more than {_LONGEST >> 20} MiB")
             self.parser.Parse(b"", True)
@@ -161,7 +156,7 @@ class _Reader:
         if self.source.elements > _ELEMENTS:
             raise ValueError(f"{self.where}it {_TOO_MUCH}")
         self.urdf = self.urdf or (tag == "robot" and self.depth == 1)
-        unread = self.urdf and tag not in _OF_URDF  # of a URDF, such as a simulator's plugins
+        unread = self.urdf and tag not in _OF_URDF  # such as a simulator's plugins
         for name, value in attributes.items():
             if wrong := "" if name in _NAMES else _wrong(name, value):
                 raise ValueError(f'{self.where}{name}="{value[:60]}" {wrong}')
@@ -169,7 +164,7 @@ class _Reader:
                 self._note(name, value)
         if tag in ("include", "model") and (name := attributes.get("file")):
             here, home = (os.path.join(folder, name) for folder in (self.path.parent, self.folder))
-            path = here if tag == "model" or not os.path.lexists(home) else home  # as MuJoCo looks
+            path = here if tag == "model" or not os.path.lexists(home) else home  # as in MuJoCo
             attributes["file"] = self.source.take(name, path, os.path.dirname(path) if tag == "model" else self.folder)
         self.builder.data("\n" * (self.parser.CurrentLineNumber - self.line))
         self.line = self.parser.CurrentLineNumber
@@ -180,7 +175,7 @@ class _Reader:
         self.builder.end(tag)
 
     def _note(self, attribute: str, name: str) -> None:
-        """A file or folder that is named."""
+        """Note a file or folder that an attribute names."""
         if self.source.file.suffix == ARCHIVE:
             raise ValueError(f"{self.where}it names {name[:200]}; the model of an archive stands alone")
         if self.source.alone and not Path(os.path.realpath(os.path.join(self.source.home, name))).is_relative_to(
@@ -196,13 +191,13 @@ class _Reader:
 
 
 def write_archive(file: Path, text: str) -> None:
-    """Write an MJCF as MuJoCo's MJZ, a zip file that holds it as model.xml. The same text makes the same file."""
+    """Write an MJCF as MuJoCo's MJZ, a zip file with one model.xml. The same text makes the same bytes."""
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(zipfile.ZipInfo(_INSIDE), text, zipfile.ZIP_DEFLATED, compresslevel=9)
 
 
 def _text(file: Path) -> str:
-    """What an MJCF or URDF says, or the one in an MJZ. Raises ValueError for too large a file, and for an MJZ with more in it."""
+    """The text of an MJCF, a URDF or an MJZ. Raises ValueError for too large a file and an MJZ with more in it."""
     _check_size(file.name, file.stat().st_size)
     if file.suffix != ARCHIVE:
         return _without_comments(file.read_text(encoding="utf-8", errors="replace"))
@@ -227,7 +222,7 @@ def _check_size(name: str, size: int) -> None:
 
 
 def _without_comments(text: str) -> str:
-    """``text`` in as many lines: many comments hold --, and <?xml ?> stands behind one, which a parser refuses and MuJoCo does not."""
+    """``text`` without comments and <?xml ?>, in as many lines: MuJoCo accepts more of both than a parser does."""
     if text.count("<!--") + text.count("<?xml") > _ELEMENTS:
         raise ValueError(f"it has more than {_ELEMENTS} comments")
     found = r"<!--.*?(?:-->|\Z)|<\?xml\s[^<>]*>"
@@ -235,27 +230,27 @@ def _without_comments(text: str) -> str:
 
 
 def _check_regular(path: str, where: str) -> None:
-    """Raises ValueError for what is there and no file, such as a device, which has no end."""
+    """Raise ValueError if ``path`` exists and is no regular file, such as a device, which never ends."""
     try:
         regular = stat.S_ISREG(os.stat(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
         return
     except OSError as error:
-        raise ValueError(f"{where}{path[:200]} can be no file: {error.strerror}") from None
+        raise ValueError(f"{where}{os.path.basename(path)[:60]} can be no file: {error.strerror}") from None
     if not regular:
         raise ValueError(f"{where}{path} is no file")
 
 
 def _numbers(value: str) -> list[float]:
-    """Those that an attribute holds; none if it holds something else."""
+    """The numbers in an attribute; none if it holds something else."""
     try:
-        return [float(part) for part in value.split(None, 9)]  # no such attribute has more
+        return [float(part) for part in value.split(None, 9)]  # the checked attributes have fewer
     except ValueError:
         return []
 
 
 def _wrong(name: str, value: str) -> str:
-    """What is wrong with the numbers of an attribute; "" if nothing is, or if they are none."""
+    """The fault of the numbers in an attribute; "" if there is none."""
     if "nan" in value.lower() and any(part.lower().strip("+-") == "nan" for part in value.split()):
         return "is not a number"
     if name.endswith("range") and len(numbers := _numbers(value)) == 2 and numbers[0] > numbers[1]:
@@ -270,7 +265,7 @@ def _wrong(name: str, value: str) -> str:
 
 
 def check_model(model: Any) -> None:
-    """Raises ValueError for a compiled model that no world can step: numbers that are none, or that no machine has."""
+    """Raise ValueError for a compiled model that cannot be stepped: numbers that are not finite, or too large."""
     gravity = model.opt.gravity
     if not np.linalg.norm(gravity) <= FASTEST:
         raise ValueError(f"gravity is {' '.join(f'{g:g}' for g in gravity)} m/s^2; it must be {FASTEST:g} at most")
@@ -284,10 +279,10 @@ def check_model(model: Any) -> None:
         most = HEAVIEST if what == "mass" else WIDEST
         if values is not None and (wrong := np.argwhere(~(np.abs(values) <= most))).size:
             value, index = values[tuple(wrong[0])], int(wrong[0][0])
-            whose = (
+            owner = (
                 f"joint '{model.joint(model.dof_jntid[index]).name}'" if kind == "dof" else _name(model, kind, index)
             )
-            raise ValueError(f"{what} of {whose} is {value:g}; it must be {most:g} at most")
+            raise ValueError(f"{what} of {owner} is {value:g}; it must be {most:g} at most")
     for kind in ("jnt", "actuator", "tendon"):
         for name in ("range", "ctrlrange", "forcerange", "actrange", "actfrcrange"):
             ranges: Any = getattr(model, f"{kind}_{name}", ())
