@@ -10,8 +10,6 @@ overflow bit ITERATIONS, states of constraint rows; in substeps without sensors 
 the world's centre of mass, and ``sensordata``.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import threading
@@ -96,10 +94,15 @@ class Shortcuts:
         kept = self._zero if sensed or not self._zero else self._zero | {self._sensordata}
         with _ALONE:
             whole = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+
+            def clear(array: wp.array) -> None:
+                if array.ptr not in kept:
+                    zero(array)
+
             try:
                 for name, launch in whole.items():
                     setattr(wp, name, skip.around(launch))
-                wp.array.zero_ = lambda array: None if array.ptr in kept else zero(array)
+                wp.array.zero_ = clear  # pyright: ignore[reportAttributeAccessIssue]
                 yield
             finally:
                 wp.array.zero_ = zero

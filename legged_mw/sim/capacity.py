@@ -3,8 +3,6 @@
 mujoco-warp allocates them at the start. Too few: contacts are dropped and reported. Too many rows cost memory and time.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Which engine steps: ``mujoco_warp`` on a GPU, or on a CPU through warp; ``mujoco``, MuJoCo's own, on a thread pool of the CPU."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

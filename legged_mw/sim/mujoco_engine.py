@@ -3,8 +3,6 @@
 It computes in float64 on rows of its own; the tensors are float32. The two meet in ``step`` and nowhere else.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import copy

@@ -1,7 +1,5 @@
 """mujoco-warp behind fixed torch tensors: every view is the simulator's own memory."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import copy
