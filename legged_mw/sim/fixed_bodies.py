@@ -77,8 +77,8 @@ def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
 def sensed_site(robot: RobotFile, model: mujoco.MjModel, wanted: str) -> str:
     """Name of a site on the root with the root's axes: ``wanted`` if it is one, else a new site at the same place.
 
-    ``wanted`` is a site or a body (its origin) that is fixed to the root. If it is empty, the site "imu" is taken; if that
-    is missing or moves, the root's origin. ``model`` is the robot compiled.
+    ``wanted`` is a site or a body (its origin) that is fixed to the root. If it is empty, the site "imu" is taken; if
+    that is missing or moves, the root's origin. ``model`` is the robot compiled.
     Raises ModelError if ``wanted`` does not exist or moves against the root.
     """
     spec, root, name = robot.spec, robot.root, wanted or _IMU

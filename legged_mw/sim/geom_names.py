@@ -21,7 +21,7 @@ class GeomNames:
     bodies: dict[str, tuple[str, ...]]  # body -> its colliding geoms; if it has none, those of bodies fixed to it
 
     def find(self, patterns: Sequence[str], what: str, colliding: bool = False) -> tuple[str, ...]:
-        """The geoms that match ``patterns``, each once, in the order of the patterns; with ``colliding`` only those that may touch.
+        """The geoms that match ``patterns``, each once, in their order; with ``colliding`` only those that may touch.
 
         A geom wins over a body of the same name. ``what`` names the caller's parameter in a ModelError.
         """

@@ -65,8 +65,8 @@ def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) 
 def replace_level_pieces(spec: mujoco.MjSpec, terrain: Terrain, notes: list[str]) -> None:
     """Replace the level pieces of the height field by boxes, and sink the field under them.
 
-    On a height field MuJoCo makes a tilted contact with every triangle near a geom, up to a dozen for a small sphere. Few
-    solver iterations leave them far from solved.
+    On a height field MuJoCo makes a tilted contact with every triangle near a geom, up to a dozen for a small sphere.
+    Few solver iterations leave them far from solved.
     """
     boxes, heights, _ = as_boxes(terrain)
     _fill_height_field(spec, terrain, heights)
@@ -101,7 +101,7 @@ def feel_all_ground(spec: mujoco.MjSpec) -> None:
 
 
 class Box(NamedTuple):
-    """A block of ground whose top is level."""
+    """A block of ground with a level top."""
 
     low: tuple[float, float]  # corner x, y [m, world]
     high: tuple[float, float]  # the opposite one

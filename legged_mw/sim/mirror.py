@@ -85,9 +85,10 @@ def _pair(
         if not fits[i].any():
             near = np.lexsort((bends[i], gaps[i].round(6)))[0]  # of equally near ones, that with the nearest axis
             limit = f" and {_AXIS_TOLERANCE:g} rad, whichever way the axis points" if what == "joint" else ""
+            mirrored, nearest = _numbers(places[i] * _POLAR), _numbers(places[near])
             raise ModelError(
                 f"{what} '{name}' has no partner on the other side: mirrored about the x-z plane of '{root}' it is at "
-                f"{_numbers(places[i] * _POLAR)} m{wanted[i]}; nearest is '{names[near]}', at {_numbers(places[near])} m"
+                f"{mirrored} m{wanted[i]}; nearest is '{names[near]}', at {nearest} m"
                 f"{found[near]} (in the frame of '{root}', all joints at zero). They must agree to {within}{limit}: "
                 "make the MJCF symmetric, or do without what mirrors the robot"
             )
@@ -95,8 +96,9 @@ def _pair(
     for i, j in enumerate(pairs):
         if pairs[j] != i:
             raise ModelError(
-                f"{what}s '{names[i]}' and '{names[pairs[j]]}' have the same mirror partner '{names[j]}': they lie closer "
-                f"together than {within} and cannot be told apart; do without one of them, or without what mirrors the robot"
+                f"{what}s '{names[i]}' and '{names[pairs[j]]}' have the same mirror partner '{names[j]}': they lie "
+                f"closer together than {within} and cannot be told apart; do without one of them, or without what "
+                "mirrors the robot"
             )
     return tuple(pairs)
 

@@ -163,7 +163,7 @@ def build_model(
 
 
 def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
-    """Read the robot in ``file``, and keep its own sensors with names in ``wanted``. Raises ModelError if it is no robot."""
+    """Read the robot in ``file``, and keep its ``wanted`` sensors. Raises ModelError if it is no robot."""
     robot = read_plain(file)
     if robot is None:
         from legged_mw.robot.vendor import read_robot  # this file is not plain

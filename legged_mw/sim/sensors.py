@@ -62,7 +62,7 @@ def add_sensors(
 
 
 def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str], more: Collection[str]) -> None:
-    """Add those of ``SENSORS`` that ``more`` names. Call it after ``add_sensors``. Both engines compute them once a step."""
+    """Add those of ``SENSORS`` that ``more`` names, after ``add_sensors``. Both engines compute them once a step."""
     for name, add in SENSORS.items():
         if name in more:
             add(spec, root, contact_geoms)

@@ -1,4 +1,4 @@
-"""A motor a joint. The caller chooses its law and gains; the machine states its force limit, armature and dry friction."""
+"""A motor a joint: the caller chooses its law and gains, the machine states force limit, armature and dry friction."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "v
 def set_machine(
     robot: RobotFile, partial: Mapping[str, Mapping[str, float]], posed: PosedRobot, drive: Drive
 ) -> tuple[float, ...]:
-    """Add motors with their force limits, armature and dry friction; ``partial`` (tables of PARTIAL) wins over the file.
+    """Add motors with force limits, armature and dry friction; ``partial`` (tables of PARTIAL) wins over the file.
 
-    Torque-speed curves in ``posed.tables`` become the joints'. Returns the speed limits (D,) [rad/s]; no limit is infinite.
+    Torque-speed curves in ``posed.tables`` become the joints'. Returns speed limits (D,) [rad/s]; no limit is infinite.
     """
     tables, notes = posed.tables, robot.notes
     tables.update(_curves_at_joints(tables))
@@ -68,8 +68,8 @@ def _add_motor(
 ) -> None:
     """Add MuJoCo's DC motor at 1 V if the joint has a curve, else its position servo or plain motor, with its limits.
 
-    A target angle is held to ``span``, the joint's range [rad]. A servo's damping is the joint's, outside of the force limit;
-    a DC motor's is part of its law, inside.
+    A target angle is held to ``span``, the joint's range [rad]. A servo's damping is the joint's, outside of the force
+    limit; a DC motor's is part of its law, inside.
     """
     kp, kd, speed = numbers["stiffness"], numbers["damping"], numbers.get("no_load_speed", 0.0)
     motor = robot.spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -110,7 +110,7 @@ def scaled_gains(
 ) -> Iterator[tuple[str, int, Tensor]]:
     """Model field, place in it and its values (N, D): ``nominal`` gains (1, D, ...) times ``factors`` (N, D).
 
-    With ``curves`` the motors are MuJoCo's DC motors: no-load speed = 1 / constant, stall torque = constant / resistance.
+    With ``curves`` they are MuJoCo's DC motors: no-load speed = 1 / constant, stall torque = constant / resistance.
     """
     field = "actuator_gainprm"
     gains = nominal[field]

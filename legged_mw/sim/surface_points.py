@@ -1,4 +1,4 @@
-"""Sample the surface of collision shapes by points or spheres: for contacts with a height field, and for lowest points."""
+"""Points and spheres on the surface of collision shapes, for contacts with a height field and for lowest points."""
 
 from __future__ import annotations
 
@@ -30,9 +30,11 @@ def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points
         return _on_mesh(model, int(model.geom_dataid[geom]), spacing), 0.0
     if kind not in _POINTS:
         shape = str(kind).rsplit("_", 1)[-1].lower()
-        text = f"geom '{model.geom(geom).name}' is a {shape}: its surface is not known as points, as those of spheres, capsules"
-        instead = "Give the MJCF one of those there, or take the engine mujoco"
-        raise ModelError(f"{text}, boxes, cylinders, ellipsoids and meshes are. {instead}")
+        known = "spheres, capsules, boxes, cylinders, ellipsoids and meshes"
+        text = (
+            f"geom '{model.geom(geom).name}' is a {shape}: its surface is not known as points, as those of {known} are"
+        )
+        raise ModelError(f"{text}. Give the MJCF one of those there, or take the engine mujoco")
     radius = float(size[0]) if kind in (_KINDS.mjGEOM_SPHERE, _KINDS.mjGEOM_CAPSULE) else 0.0
     return np.array(_POINTS[kind](size, spacing), dtype=float).reshape(-1, 3), radius
 
@@ -84,7 +86,7 @@ def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
 
 
 def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[int]) -> Points:
-    """Points (P, 3) of ``triangles`` (T, 3, 3) on lines parallel to ``axis``; ``lines`` (L, 2) are along the axes ``across``."""
+    """Points (P, 3) of ``triangles`` (T, 3, 3) on lines along ``axis``, at ``lines`` (L, 2) ``across`` it."""
     a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     (au, av), (bu, bv), (cu, cv) = a[:, across].T, ab[:, across].T, ac[:, across].T
     # a triangle parallel to the lines has no area across them, and meets none
@@ -133,7 +135,7 @@ def add_sites(
 ) -> None:
     """Add each site (name -> geoms) that ``spec`` lacks, with the joints at ``angles`` (D,) [rad].
 
-    A site of one geom is at its centre. A site of several is in the middle of their lowest points, on the body of the lowest geom.
+    A site of one geom is at its centre. A site of several is in the middle of their lowest points, on the lowest body.
     """
     missing = {name: geoms for name, geoms in sites.items() if spec.site(name) is None}
     if not missing:
