@@ -32,7 +32,7 @@ def some_joints(
 ) -> dict[str, float]:
     """Joint -> value, for those of ``joints`` that a key fits. A key fits if it is the joint's name or a part of it.
 
-    Raises ModelError for a key that fits neither ``joints`` nor ``spare``, and for two keys that fit a joint equally well.
+    Raises ModelError for a key that fits neither ``joints`` nor ``spare``, and for two keys that fit equally well.
     """
     for key in table:
         if key and not any(key in joint for joint in (*joints, *spare)):
@@ -109,13 +109,9 @@ def pose_joints(
     known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "pose")}
     model = robot.model
     if welded:
-        nearest_to_0 = [float(np.clip(0.0, *span)) for span in _ranges(model, welded)]
-        hold_joints(
-            robot.spec,
-            model,
-            {name: known.get(name, zero) for name, zero in zip(welded, nearest_to_0, strict=True)},
-            robot.notes,
-        )
+        spans = zip(welded, _ranges(model, welded), strict=True)
+        nearest_to_0 = {name: float(np.clip(0.0, *span)) for name, span in spans}
+        hold_joints(robot.spec, model, {name: known.get(name, nearest_to_0[name]) for name in welded}, robot.notes)
         model = robot.spec.copy().compile()
     ranges = _ranges(model, moving)
     if free := [name for name, span in zip(moving, ranges, strict=True) if not np.isfinite(span).all()]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -40,7 +40,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class RobotFile:
-    """A robot alone: one root with a free joint, named joints, no actuators; sensors that feel contact or are wanted."""
+    """A robot alone: one root with a free joint, named joints, no actuators, few of its own sensors."""
 
     spec: mujoco.MjSpec
     model: mujoco.MjModel  # the same, compiled
@@ -66,7 +66,8 @@ def read_plain(file: Path) -> RobotFile | None:
     """Read a plain MJCF. None if ``file`` is not plain: ``legged_mw.robot.vendor`` reads it or says why not."""
     if not file.is_file():
         return None
-    with naming(file):
+    # after an error the vendor's reader reads the file again and reports it
+    with suppress(ValueError, RecursionError), warnings.catch_warnings(record=True) as said:
         source, notes = Source(file), list[str]()
         if not _is_plain(source):
             return None
@@ -82,13 +83,11 @@ def read_plain(file: Path) -> RobotFile | None:
             notes.append(f"keyframe '{key.name}' read: pose and height of the root, where nothing else states them")
             spec.delete(key)
         spec.nkey = 0
-        try:
-            with warnings.catch_warnings(record=True) as said:
-                model = compile_copy(spec)
-        except ValueError:
-            return None
+        model = compile_copy(spec)
         check_model(model)
-    return None if said else RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
+        if not said:
+            return RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
+    return None
 
 
 def _is_plain(source: Source) -> bool:
@@ -113,7 +112,7 @@ def _tags(element: Element) -> set[str]:
 
 
 def joint_limits(spec: mujoco.MjSpec) -> dict[str, Range]:
-    """Joint -> lowest and highest force [N m], of the joints that have an actuatorfrcrange; a URDF's effort is read as one."""
+    """Joint -> lowest and highest force [N m], of joints with an actuatorfrcrange (in a URDF: effort)."""
     return {
         joint.name: tuple(joint.actfrcrange)
         for joint in spec.joints
@@ -127,7 +126,7 @@ def is_limited(switch: int, span: np.ndarray) -> bool:
 
 
 def compile_copy(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a copy of ``spec``; visual geoms only if some come from files, since they are slow and only files can be wrong."""
+    """Compile a copy of ``spec``. Visual geoms are slow: compile them only to find mistakes in files of theirs."""
     copy = spec.copy()
     copy.compiler.discardvisual = not any(item.file for item in (*spec.meshes, *spec.textures))
     return copy.compile()
