@@ -1,1 +1,1 @@
-"""Speed alone: the step compiler, skipped physics kernels, the update's kernels. Without this folder all works, slower."""
+"""Speed only: the step compiler, skipped physics kernels, kernels of the update. All works without this folder."""

@@ -1,8 +1,8 @@
-"""How many contacts sensed geoms have with another geom, counted by one kernel in place of mujoco-warp's search, sort and readout."""
+"""Count the contacts of sensed geoms in one kernel, instead of mujoco-warp's search, sort and readout."""
 
-# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportCallIssue=false, reportAssignmentType=false
-# pyright: reportArgumentType=false, reportIndexIssue=false
-# (mujoco ships no type stubs, and warp compiles what it finds written here as its own language)
+# pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportIndexIssue=false, reportAttributeAccessIssue=false
+# (mujoco ships no type stubs, and warp compiles this file as its own language)
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from mujoco_warp._src.types import ContactType
 
 wp.set_module_options({"enable_backward": False})
 
-_CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))  # a contact that pushes; others are in for sensors alone
+_CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))  # a contact that pushes; others only feed sensors
 _FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
 
 
@@ -31,7 +31,10 @@ def countable(model: mujoco.MjModel) -> dict[int, tuple[int, int, int]]:
 
 
 def count_contacts(model: mujoco.MjModel, put: mjw.Model) -> Callable[[mjw.Data], None]:
-    """Take the countable sensors from ``put``, a model on the current device; what fills them, to be called after a step."""
+    """Remove the countable sensors from ``put``, a model on the current device.
+
+    Returns a function that fills them after a step.
+    """
     sensors = countable(model)
     left = [int(i) for i in put.sensor_contact_pos_adr.numpy() if int(i) not in sensors]
     put.sensor_contact_pos_adr = wp.array(left, dtype=int)

@@ -1,12 +1,12 @@
-"""A recorded step's many small operations, fused: a thread runs a world through as many of them as it can, in one warp kernel.
+"""Fuse the many small operations of a step into a few warp kernels, in which a thread computes one world.
 
-The step stays the Python that it is. One real call of it is traced; what each world does for itself goes into a few kernels, what
-does not fit (random numbers, sums over worlds) stays torch's, and the simulator's calls stay where they are. Before a fused
-step is used it is held, part by part, against the operations it replaces, on a real step's data.
+One real call of the step is traced. Operations within a world go into kernels. Others (random numbers, sums over
+worlds) stay torch's, and the simulator's calls keep their places. Before a fused step is used, each part of it is
+compared with the operations that it replaces, on the data of a real step.
 """
 
 # pyright: reportInvalidTypeForm=false
-# (warp compiles what it finds written here as its own language)
+# (warp compiles this file as its own language)
 from __future__ import annotations
 
 import heapq
@@ -22,23 +22,23 @@ from legged_mw.fast.fused_code import ADD_ROWS, Writer
 from legged_mw.fast.fused_memory import HELPERS, TYPES, Access, Code, Unfit
 from legged_mw.fast.trace import Call, Node, Trace, alike
 
-if wp.config.log_level < wp.LOG_WARNING:  # no engine of warp's steps here, and nobody asks what warp finds and loads
+if wp.config.log_level < wp.LOG_WARNING:  # MuJoCo's engine steps: keep warp from announcing its devices and modules
     wp.config.log_level = wp.LOG_ERROR
 
-BLOCK, LANES = 32, 8  # threads of a block, of a world: 4096 worlds occupy every part of a large GPU
-_ROOM = 44_000 * LANES // BLOCK  # bytes of a world's own values in a block's shared memory
-_CLOSE = 1e-4  # relative and absolute, of values that are the same to float32 rounding after some operations
-_STRAYS = 0.002  # share of elements that may be another: a comparison that rounding turned
+BLOCK, LANES = 32, 8  # threads a block, threads a world: 4096 worlds fill a large GPU
+_ROOM = 44_000 * LANES // BLOCK  # bytes of shared memory for the temporaries of one world
+_CLOSE = 1e-4  # relative and absolute tolerance: float32 rounding over a few operations
+_STRAYS = 0.002  # share of elements that may differ more, where rounding flipped a comparison
 
 
 class Kernel:
-    """Nodes that a thread runs a world through; on a GPU a few threads, lanes, that share the elements of its values."""
+    """A kernel over several nodes: one thread a world on a CPU, several threads (lanes) a world on a GPU."""
 
     def __init__(self, nodes: Sequence[Node], worlds: int) -> None:
         self.nodes, self._worlds = nodes, worlds
 
     def write(self, trace: Trace, own: set[int]) -> None:
-        """Make the source. The ``own`` blocks are needed nowhere else: they stay with the thread, as far as there is room."""
+        """Generate the source. Blocks in ``own`` are temporaries of this kernel, in shared memory if they fit."""
         used = dict.fromkeys(view.block for node in self.nodes for view in (*node.reads, *node.writes))
         self._device = str(trace.blocks[next(iter(used))].device)
         self._lanes = 1 if self._device == "cpu" else LANES
@@ -64,11 +64,11 @@ class Kernel:
         self._kernel = _kernel_of(wp.func_native(self._source)(_body))
 
     def _size(self, tensor: Tensor) -> int:
-        """Elements of a world's part of a tensor, or of one that all share."""
+        """Elements of one world's part of a tensor, or of a whole tensor that all worlds share."""
         return tensor.numel() // (self._worlds if tensor.shape[:1] == (self._worlds,) else 1)
 
     def compile(self) -> None:
-        """Into warp's cache of kernels, if it is not there; nothing is loaded. On a CPU that is done when it is loaded."""
+        """Compile into warp's kernel cache, without loading. On a CPU loading compiles."""
         if self._device != "cpu":
             wp.compile_aot_module(self._kernel.module, device=self._device)
 
@@ -94,10 +94,10 @@ def _kernel_of(body: Any) -> Any:
 
 
 class Region:
-    """Operations between two calls of the simulator: as they were, and fused."""
+    """The operations between two calls of the simulator, original and fused."""
 
     def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace, device: str, there: set[int]) -> None:
-        """``there``: blocks of memory that were there before."""
+        """``there``: blocks of memory that exist before the step."""
         self.nodes = _join_sums(nodes)
         self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace, device))
         written = {view.block for node in self.nodes for view in node.writes} & there
@@ -112,7 +112,7 @@ class Region:
             step() if isinstance(step, Kernel) else _replay(step)
 
     def verify(self, device: str) -> bool:
-        """Run as it was, then fused from the same state. Returns whether both did the same; if not, it stays as it was."""
+        """Run original and fused kernels from the same state. Returns whether they agree; if not, keep the original."""
         before, random = [value.clone() for value in self._written], _generator(device).get_state()
         for node in self.nodes:
             _replay(node)
@@ -130,7 +130,7 @@ class Region:
 
 
 class Fused:
-    """A step, from a trace of one call: ``compile`` it (in a thread, if wanted), ``verify`` it on a real step, call it."""
+    """A step, fused from its trace: ``compile`` it (in any thread), ``verify`` it on a real step, then call it."""
 
     def __init__(self, trace: Trace, worlds: int, device: str) -> None:
         self._device, self.parts = device, list[Region | Call]()
@@ -173,13 +173,13 @@ class Fused:
         return [kernel for part in self.parts if isinstance(part, Region) for kernel in part.kernels]
 
     def compile(self) -> None:
-        """Compile what warp's cache does not have; nothing that a recording on the same GPU would mind."""
+        """Compile the kernels that are not in warp's cache. Safe beside a graph capture on the same GPU."""
         for kernel in self.kernels:
             kernel.compile()
         self.compiled = True
 
     def verify(self) -> int:
-        """Load what is compiled and run one real step with it; returns how many of its parts have to stay as they were."""
+        """Load the kernels and run one real step with them. Returns how many regions keep their original operations."""
         for kernel in self.kernels:
             kernel.load()
         wrong = 0
@@ -195,14 +195,14 @@ class Fused:
             part() if isinstance(part, Region) else part.run()
 
 
-# ---- which operations go together -----------------------------------------------------------------------------------------
+# ---- scheduling -----------------------------------------------------------------------------------------
 
 
 def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> Iterator[Kernel | Node]:
-    """The nodes in an order that is as good, those that fit together in kernels that are as few as may be."""
+    """Sort the operations topologically and group them into as few kernels as possible."""
     codes = [_code(node, worlds, trace, device) for node in nodes]
     waits, wakes = _dependencies(nodes)
-    ready: tuple[list[int], list[int]] = ([], [])  # torch's, and ours
+    ready: tuple[list[int], list[int]] = ([], [])  # nodes of torch, nodes that fit a kernel
 
     def wake(i: int) -> None:
         heapq.heappush(ready[codes[i] is not None], i)
@@ -240,7 +240,7 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> 
 
 
 def _join_sums(nodes: Sequence[Node]) -> list[Node]:
-    """A sum over worlds that is then added to a fixed value becomes one operation; the sum itself nobody reads."""
+    """Join a sum over worlds and its addition to a fixed tensor into one node, if the sum has no other reader."""
     joined = list[Node]()
     for node in nodes:
         total = joined[-1] if joined else node
@@ -267,7 +267,7 @@ def _join_sums(nodes: Sequence[Node]) -> list[Node]:
 
 
 def _code(node: Node, worlds: int, trace: Trace, device: str) -> Code | None:
-    """What the node does for a world, where it can be said."""
+    """C code of the node for one world; None if it has none."""
     out = node.writes[0]
     shared = worlds not in out.shape[:1] and node.func is not ADD_ROWS
     if node.random or out.block in trace.watched or (shared and out.block not in trace.made):
@@ -275,13 +275,13 @@ def _code(node: Node, worlds: int, trace: Trace, device: str) -> Code | None:
     for view in (*node.reads, *node.writes):
         if str(trace.blocks[view.block].device) != device or trace.blocks[view.block].dtype != view.dtype:
             return None
-    with suppress(Unfit, TypeError, ValueError, IndexError):  # of arguments in a form that is not known here
+    with suppress(Unfit, TypeError, ValueError, IndexError):  # arguments in an unknown form
         return Writer(worlds, trace.view, lambda block: (f"p{block}", False)).emit(node)
     return None
 
 
 def _dependencies(nodes: Sequence[Node]) -> tuple[list[int], list[set[int]]]:
-    """How many nodes each waits for, and which ones wait for it: by blocks of memory, and draws in turn."""
+    """Each node's number of dependencies, and its dependents: by blocks of memory; draws keep their order."""
     after: list[set[int]] = [set() for _ in nodes]
     wrote, read, drew = dict[int, int](), dict[int, set[int]](), -1
     for i, node in enumerate(nodes):
@@ -306,7 +306,7 @@ def _dependencies(nodes: Sequence[Node]) -> tuple[list[int], list[set[int]]]:
 
 
 class _Rows:
-    """What the nodes of a kernel reach: where one writes, every one keeps to the rows of its own world."""
+    """The memory accesses of a kernel. In a block that one node writes, all nodes must stay in their world's row."""
 
     def __init__(self, worlds: int) -> None:
         self._worlds = worlds
@@ -314,9 +314,9 @@ class _Rows:
         self._written: set[int] = set()
 
     def take(self, code: Code) -> bool:
-        """Take the node in, if it fits."""
+        """Add the node if it fits."""
         block = code.write.view.block
-        if code.write.pitch < 0:  # a sum over worlds: complete only when all are through
+        if code.write.pitch < 0:  # a sum over worlds: complete only after all threads
             whole = {access.view.block for access in code.reads if self._row(access) <= 0}
             if block in self._pitches or whole & self._written:
                 return False
@@ -340,18 +340,18 @@ class _Rows:
         return True
 
     def _row(self, access: Access) -> int:
-        """The pitch of the rows that the access keeps to; 0: of a value that all share; -1: it does not keep to any."""
+        """Pitch of the row that the access stays in; 0: a value that all worlds share; -1: it leaves its row."""
         if access.pitch == 0:
             return 0
         low = access.low % (self._worlds * access.pitch)
         return access.pitch if low + access.high - access.low <= access.pitch else -1
 
 
-# ---- what stays torch's ---------------------------------------------------------------------------------------------------
+# ---- operations left to torch ---------------------------------------------------------------------------------------
 
 
 def _replay(node: Node) -> None:
-    """Do again what the node did, to the same memory."""
+    """Run the node again on the same memory."""
     if node.func is ADD_ROWS:
         ADD_ROWS(*node.args)
     elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like) and not node.kwargs.get(

@@ -1,7 +1,7 @@
-"""Torch's operations as lines of C, for one world each: what a thread does that runs a world through many of them.
+"""Generate C for torch's operations, as one thread runs them for one world.
 
-An operation fits if each world's result depends on that world's values and on what all worlds share. What does not fit, or is
-not known here, is left to torch: ``emit`` raises ``Unfit``.
+An operation fits if a world's result depends only on its own values and on values that all worlds share. Other and
+unknown operations are left to torch: ``emit`` raises ``Unfit``.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from torch import Tensor
 from legged_mw.fast.fused_memory import TYPES, WORLD, Access, Code, Lines, Unfit, span_of, spread
 from legged_mw.fast.trace import Node
 
-SMALL = 64  # elements of a value that all worlds share: each thread computes it for itself
+SMALL = 64  # elements of a shared value up to which each thread computes it for itself
 
 
 class _AddRows:
-    """Stands for ``to.add_(rows.sum(dim=0))``, which torch does in two operations."""
+    """Stands for ``to.add_(rows.sum(dim=0))``, two operations of torch."""
 
     tags = ()
     overloadpacket = None
@@ -32,21 +32,25 @@ class _AddRows:
 ADD_ROWS = _AddRows()
 
 
-_ONE = {  # name -> C, of one value a
-    "neg": "-{a}", "abs": "({a} < 0 ? -{a} : {a})", "sqrt": "sqrtf({a})", "rsqrt": "1.0f / sqrtf({a})", "exp": "expf({a})",
-    "log": "logf({a})",
-    "sin": "sinf({a})", "cos": "cosf({a})", "tan": "tanf({a})", "asin": "asinf({a})", "acos": "acosf({a})", "atan": "atanf({a})",
-    "tanh": "tanhf({a})", "sigmoid": "1.0f / (1.0f + expf(-{a}))", "floor": "floorf({a})", "ceil": "ceilf({a})", "round": "rintf({a})",
+_ONE = {  # name -> C of a unary operation on a
+    "neg": "-{a}", "abs": "({a} < 0 ? -{a} : {a})", "sqrt": "sqrtf({a})", "rsqrt": "1.0f / sqrtf({a})",
+    "exp": "expf({a})", "log": "logf({a})",
+    "sin": "sinf({a})", "cos": "cosf({a})", "tan": "tanf({a})", "asin": "asinf({a})", "acos": "acosf({a})",
+    "atan": "atanf({a})",
+    "tanh": "tanhf({a})", "sigmoid": "1.0f / (1.0f + expf(-{a}))",
+    "floor": "floorf({a})", "ceil": "ceilf({a})", "round": "rintf({a})",
     "trunc": "truncf({a})", "reciprocal": "1.0f / {a}", "sign": "({a} > 0) - ({a} < 0)", "logical_not": "!{a}",
     "copy": "{a}", "clone": "{a}", "to_copy": "{a}", "to": "{a}",
     "sinc": "({a} == 0.0f ? 1.0f : sinf(3.14159265358979f * {a}) / (3.14159265358979f * {a}))",
     "isnan": "{a} != {a}", "isfinite": "FINITE({a})", "square": "{a} * {a}",
 }  # fmt: skip
-_TWO = {  # of a and b
-    "add": "{a} + {b}", "sub": "{a} - {b}", "rsub": "{b} - {a}", "mul": "{a} * {b}", "div": "{a} / {b}", "atan2": "atan2f({a}, {b})",
-    "hypot": "sqrtf({a} * {a} + {b} * {b})", "maximum": "MAXIMUM({a}, {b})", "minimum": "MINIMUM({a}, {b})",
-    "clamp_min": "MAXIMUM({a}, {b})", "clamp_max": "MINIMUM({a}, {b})", "remainder": "({a} - {b} * floorf({a} / {b}))",
-    "eq": "{a} == {b}", "ne": "{a} != {b}", "lt": "{a} < {b}", "le": "{a} <= {b}", "gt": "{a} > {b}", "ge": "{a} >= {b}",
+_TWO = {  # of a binary operation on a and b
+    "add": "{a} + {b}", "sub": "{a} - {b}", "rsub": "{b} - {a}", "mul": "{a} * {b}", "div": "{a} / {b}",
+    "atan2": "atan2f({a}, {b})", "hypot": "sqrtf({a} * {a} + {b} * {b})", "maximum": "MAXIMUM({a}, {b})",
+    "minimum": "MINIMUM({a}, {b})", "clamp_min": "MAXIMUM({a}, {b})", "clamp_max": "MINIMUM({a}, {b})",
+    "remainder": "({a} - {b} * floorf({a} / {b}))",
+    "eq": "{a} == {b}", "ne": "{a} != {b}", "lt": "{a} < {b}", "le": "{a} <= {b}",
+    "gt": "{a} > {b}", "ge": "{a} >= {b}",
     "logical_and": "{a} && {b}", "logical_or": "{a} || {b}", "logical_xor": "!{a} != !{b}",
     "bitwise_and": "{a} & {b}", "bitwise_or": "{a} | {b}", "bitwise_xor": "{a} ^ {b}", "and": "{a} & {b}",
     "or": "{a} | {b}", "xor": "{a} ^ {b}", "iand": "{a} & {b}", "ior": "{a} | {b}",
@@ -57,30 +61,19 @@ _THREE = {
     "lerp": "({c} < 0.5f ? {a} + {c} * ({b} - {a}) : {b} - ({b} - {a}) * (1.0f - {c}))",
 }  # fmt: skip
 _COPIES = {"copy", "clone", "to_copy", "to"}
-_COMPARING = {
-    "eq",
-    "ne",
-    "lt",
-    "le",
-    "gt",
-    "ge",
-    "isnan",
-    "isfinite",
-    "logical_and",
-    "logical_or",
-    "logical_not",
-    "logical_xor",
-}
-_FLOATS = {name for name, text in {**_ONE, **_TWO, **_THREE}.items() if "f(" in text or "." in text}  # only of float32
+_COMPARING = {"eq", "ne", "lt", "le", "gt", "ge", "isnan", "isfinite"}
+_COMPARING |= {"logical_and", "logical_or", "logical_not", "logical_xor"}
+_FLOATS = {name for name, text in {**_ONE, **_TWO, **_THREE}.items() if "f(" in text or "." in text}  # for float32 only
 _CONSTANTS = {"zeros_like": 0, "zeros": 0, "zero": 0, "new_zeros": 0, "ones_like": 1, "ones": 1, "new_ones": 1}
-_REDUCTIONS = {  # name -> start, step from the sum so far and a value
-    "sum": ("0", "{s} + {a}"), "mean": ("0", "{s} + {a}"), "linalg_vector_norm": ("0", "{s} + {a} * {a}"), "any": ("0", "{s} || {a}"),
-    "all": ("1", "{s} && {a}"), "amax": ("", "MAXIMUM({s}, {a})"), "amin": ("", "MINIMUM({s}, {a})"), "prod": ("1", "{s} * {a}"),
+_REDUCTIONS = {  # name -> initial value, update of the accumulator s by a
+    "sum": ("0", "{s} + {a}"), "mean": ("0", "{s} + {a}"), "linalg_vector_norm": ("0", "{s} + {a} * {a}"),
+    "any": ("0", "{s} || {a}"), "all": ("1", "{s} && {a}"), "prod": ("1", "{s} * {a}"),
+    "amax": ("", "MAXIMUM({s}, {a})"), "amin": ("", "MINIMUM({s}, {a})"),
 }  # fmt: skip
 
 
 class Writer(Lines):
-    """Writes the lines of operations."""
+    """Generates the lines of operations."""
 
     def emit(self, node: Node) -> Code:
         """The lines of ``node``. Raises Unfit."""
@@ -104,7 +97,7 @@ class Writer(Lines):
         return Code(["{", *lines, "}", "SYNC"], self._reads, self._access(out, out.shape))
 
     def _add_rows(self, to: Tensor, rows: Tensor) -> Code:
-        """Sums over worlds of what is nearly everywhere 0, such as counts: who has something adds it."""
+        """Sums over worlds of values that are mostly 0, such as counts: a thread adds only a value that is not 0."""
         out, source = self._view(to), self._view(rows)
         if out.dtype != torch.float32 or rows.shape[0] != self._worlds or math.prod(rows.shape[1:]) != to.numel():
             raise Unfit
@@ -117,7 +110,7 @@ class Writer(Lines):
         )
         return Code(["{", *lines, "}", "SYNC"], self._reads, Access(out, -1, 0, 0))
 
-    # ---- operations ------------------------------------------------------------------------------------------------------
+    # ---- operations --------------------------------------------------------------------------------------------------
 
     def _elementwise(self, node: Node, name: str) -> list[str]:
         shape, args = self._out.shape, list(node.args)
@@ -147,7 +140,7 @@ class Writer(Lines):
         return self._store(shape, index, value, [arg for arg in args if isinstance(arg, Tensor)])
 
     def _kinds(self, name: str, args: Sequence[Any]) -> list[torch.dtype]:
-        """The types that the operands are brought to."""
+        """The types that the operands are converted to."""
         if name in _COPIES:
             return [args[0].dtype]
         if name in _COMPARING:
@@ -235,7 +228,7 @@ class Writer(Lines):
         return self._emit_constant_pad_nd(x, pad, value or 0)
 
     def _emit_flatten(self, x: Tensor, *_: Any) -> list[str]:
-        """The same elements in a new shape, where that takes a copy."""
+        """The same elements in a new shape, if that needs a copy."""
         view, strides = self._view(x), [math.prod(x.shape[d + 1 :]) for d in range(x.dim())]
         if self._shared or x.shape[0] != self._worlds or self._out.dtype != x.dtype:
             raise Unfit
@@ -265,8 +258,10 @@ class Writer(Lines):
         self._reads.append(self._access(view, x.shape))
         start, step = _REDUCTIONS[name]
         element, first = (f"({kind})({self._at(view, view.strides, where)})" for where in (index, kept))
-        inner = self._loops([n if d in dims else 1 for d, n in enumerate(x.shape)], [i if d in dims else "0" for d, i in enumerate(index)],
-                            [f"{kind} a = {element};", f"s = {step.format(s='s', a='a')};"], alone=True)  # fmt: skip
+        summed = [n if d in dims else 1 for d, n in enumerate(x.shape)]
+        along = [i if d in dims else "0" for d, i in enumerate(index)]
+        update = [f"{kind} a = {element};", f"s = {step.format(s='s', a='a')};"]
+        inner = self._loops(summed, along, update, alone=True)
         end = {"mean": f"s / {math.prod(x.shape[d] for d in dims)}", "linalg_vector_norm": "sqrtf(s)"}.get(name, "s")
         body = [f"{kind} s = {start or first};", *inner, f"{self._write(out)} = {end};"]
         return self._loops([1 if d in dims else n for d, n in enumerate(x.shape)], kept, body)
@@ -300,7 +295,7 @@ class Writer(Lines):
         return self._join(tensors, dim, stacked=True)
 
     def _picked(self, x: Tensor, place: Sequence[str]) -> str:
-        """An element of ``x`` at indices that are known at run time; of worlds' own values only the world's own."""
+        """An element of ``x`` at indices computed at run time; in a tensor of worlds only the world's own row."""
         view = self._view(x)
         own = bool(place) and place[0] == WORLD and x.shape[0] == self._worlds
         access = self._access(view, view.shape) if own else Access(view, 0, view.offset, view.offset + span_of(view))

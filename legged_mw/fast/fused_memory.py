@@ -1,4 +1,4 @@
-"""Where values lie, in C: a world's element of a view of memory, loops over elements, and how they are shared by a world's lanes."""
+"""C code for memory: elements of a view, loops over elements, and how the lanes of a world share them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Unfit(Exception):
 
 
 class Access(NamedTuple):
-    """What a world reaches of a view: elements [low, high) of a row every ``pitch`` elements; all worlds the same where pitch is 0."""
+    """A world's part of a view: elements [low, high) of its row. Rows are ``pitch`` apart; 0: all worlds share one."""
 
     view: View
     pitch: int
@@ -53,7 +53,7 @@ class Access(NamedTuple):
 
 
 class Code(NamedTuple):
-    """An operation's lines, and what it reaches: reads first, the write last."""
+    """An operation's lines and its accesses: reads first, the write last."""
 
     lines: list[str]
     reads: list[Access]
@@ -61,17 +61,17 @@ class Code(NamedTuple):
 
 
 class Lines:
-    """Lines of C about memory. ``place`` gives the C name of a block of memory and whether it is a world's own."""
+    """Generates C for memory. ``place`` gives a block's name in C, and whether it is a temporary of one world."""
 
-    _out: View  # what the operation at hand writes to
-    _reads: list[Access]  # what it reads
+    _out: View  # output of the current operation
+    _reads: list[Access]  # its reads
     _shared: bool  # it is one value for all worlds
 
     def __init__(self, worlds: int, view: Callable[[Tensor], View], place: Callable[[int], tuple[str, bool]]) -> None:
         self._worlds, self._view, self._place = worlds, view, place
 
     def _access(self, view: View, shape: Sequence[int]) -> Access:
-        """What a world reaches of ``view`` when it is spread over ``shape``, whose first dimension are worlds."""
+        """A world's part of ``view`` broadcast to ``shape``, with worlds along the first dimension."""
         strides = spread(view, shape)
         pitch = 0 if self._shared or not strides else strides[0]
         inner = strides if self._shared else strides[1:]
@@ -88,7 +88,7 @@ class Lines:
         return f"{name}[{' + '.join(terms) or '0'}]"
 
     def _read(self, tensor: Tensor, shape: Sequence[int], index: Sequence[str]) -> str:
-        """An element of ``tensor`` spread over ``shape``."""
+        """An element of ``tensor`` broadcast to ``shape``."""
         view = self._view(tensor)
         self._reads.append(self._access(view, shape))
         return self._at(view, spread(view, shape), index)
@@ -102,7 +102,7 @@ class Lines:
         return names if self._shared else [WORLD, *names[1:]]
 
     def _loops(self, shape: Sequence[int], index: Sequence[str], body: Iterable[str], alone: bool = False) -> list[str]:
-        """``body`` for each element, the first loop shared among a world's lanes; or by a lane ``alone``."""
+        """Loops of ``body`` over all elements; a world's lanes share the first loop, or one lane runs it ``alone``."""
         loops = [(n, i) for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
         heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in loops]
         if not alone:
@@ -115,7 +115,7 @@ class Lines:
         return [" ".join(heads) + " {", *body, "}"]
 
     def _store(self, shape: Sequence[int], index: Sequence[str], value: str, reads: Iterable[Tensor] = ()) -> list[str]:
-        """Write ``value`` everywhere; by way of a copy where it is read from the same memory elsewhere."""
+        """Write ``value`` to every element; through a copy if it reads other elements of the same memory."""
         kind = TYPES[self._out.dtype]
         views = [self._view(tensor) for tensor in reads]
         if all(view.block != self._out.block or view[2:] == self._out[2:] for view in views):
@@ -133,7 +133,7 @@ class Lines:
 
 
 def spread(view: View, shape: Sequence[int]) -> list[int]:
-    """Strides of ``view`` spread over ``shape``: 0 where it is repeated."""
+    """Strides of ``view`` broadcast to ``shape``: 0 where it is repeated."""
     strides = [s if n != 1 else 0 for n, s in zip(view.shape, view.strides, strict=True)]
     return [0] * (len(shape) - len(strides)) + strides
 

@@ -1,13 +1,13 @@
-"""Warp kernels of the recorded update, each in place of a dozen of torch's. Callers run torch's own on a CPU.
+"""Warp kernels of the recorded update; each replaces about a dozen of torch's. On a CPU callers use torch's own.
 
-All of them go into the stream that torch uses, and so into the graph that it records.
+They run in torch's stream, so its graph captures them.
 """
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false, reportReturnType=false
-# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportAssignmentType=false
-# pyright: reportRedeclaration=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportAttributeAccessIssue=false
+# pyright: reportReturnType=false, reportAssignmentType=false, reportRedeclaration=false
 # ruff: noqa: UP018
-# (warp compiles what it finds written here as its own language: int() makes a variable, and functions differ by their types)
+# (warp compiles this file as its own language: int() makes a variable, and types overload functions)
 from __future__ import annotations
 
 import functools
@@ -19,15 +19,15 @@ import warp as wp
 from torch import Tensor
 
 ROWS = 32  # summed by a thread
-_AT_ONCE = 8  # rows that it reads before it writes any: it waits for memory once for them
+_AT_ONCE = 8  # rows that it reads before it writes any, to wait for memory once
 _Rows = wp.types.matrix(shape=(_AT_ONCE, 4), dtype=float)
-_BLOCK = 128  # threads: of small layers, too, each processor gets some
+_BLOCK = 128  # threads a block: few enough that small layers use every processor
 _HALF_LOG_2PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 
 
 def launch(kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
     """Run a kernel over tensors and numbers in torch's stream."""
-    wp.init()  # which is nothing where a simulation has done so
+    wp.init()  # no effect if a simulation did so
     device = next(each.device for each in inputs if isinstance(each, Tensor))
     arrays = [_array(each.detach()) if isinstance(each, Tensor) else each for each in inputs]
     stream = _stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
@@ -35,16 +35,16 @@ def launch(kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
 
 
 def load(device: str) -> None:
-    """Compile all of them for a device, or find them compiled."""
+    """Compile all kernels for a device, or load them from the cache."""
     wp.load_module(__name__, device=device)
 
 
 def _array(x: Tensor) -> wp.array:
-    """As warp sees it: three dimensions are two of fours, none is one of one."""
+    """A tensor as a warp array: (a, b, 4) becomes (a, b) vectors, a scalar one element."""
     return wp.from_torch(x, dtype=wp.vec4) if x.dim() == 3 else wp.from_torch(x.view(x.shape or 1))
 
 
-_stream = functools.cache(wp.stream_from_torch)  # none is made while a graph is recorded
+_stream = functools.cache(wp.stream_from_torch)  # a stream must not be wrapped during capture
 
 
 # ---- the networks ---------------------------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ def _unpack(x: wp.vec4):
 
 @wp.func
 def _unpack(x: wp.int64):
-    """Four values of bfloat16, whose bits are the upper half of a float's; the first is the lowest."""
+    """Unpack four bfloat16 values, the first in the lowest bits. Their bits are the upper half of a float's."""
     bits = wp.cast(x, wp.uint64)
     low = wp.uint32(bits)
     high = wp.uint32(bits >> wp.uint64(32))
@@ -72,7 +72,7 @@ def _unpack(x: wp.int64):
 
 @wp.func
 def _round(low: float, high: float):
-    """The bits of two values in bfloat16, beside each other."""
+    """Pack two values as bfloat16."""
     return (wp.uint32(wp.cast(wp.bfloat16(high), wp.uint16)) << wp.uint32(16)) | wp.uint32(
         wp.cast(wp.bfloat16(low), wp.uint16)
     )
@@ -114,19 +114,19 @@ for _types in ((wp.vec4, wp.vec4, wp.vec4), (wp.int64, wp.int64, wp.int64), (wp.
 
 
 def _fours(x: Tensor) -> Tensor:
-    """(B, C) as C / 4 columns of four values: of bfloat16 a whole number, of float32 a vector."""
+    """(B, C) as C / 4 columns of four values: an integer of bfloat16 bits, or a float32 vector."""
     return x.view(torch.int64) if x.dtype == torch.bfloat16 else x.unflatten(1, (-1, 4))
 
 
 def fits(rows: int, sizes: list[int]) -> bool:
-    """Whether ``elu_backward`` takes layers of such sizes."""
+    """Whether ``elu_backward`` supports layers of these sizes."""
     return rows % _AT_ONCE == 0 and not any(size % 4 for size in sizes)
 
 
 def elu_backward(grad: Tensor, out: Tensor, sums: Tensor, first: int) -> Tensor:
-    """The gradient before an ELU, from that after it and its output, all (B, C); of the output's type.
+    """The gradient at an ELU's input, from that at its output and the output itself, all (B, C), in the output's type.
 
-    Its sums over every ROWS rows go to the columns of ``sums`` (B / ROWS, ...) that begin at ``first``. float32 or bfloat16.
+    Its sums over every ROWS rows go to the columns of ``sums`` (B / ROWS, ...) from ``first`` on. float32 or bfloat16.
     """
     into = torch.empty_like(out)
     launch(_elu_backward, (len(sums), out.shape[1] // 4), *map(_fours, (grad, out, into, sums)), first // 4)
@@ -143,11 +143,11 @@ def policy_loss(
     actions: wp.array2d[float],
     advantages: wp.array2d[float],
     old_log_prob: wp.array2d[float],
-    old_mean: wp.array2d[float],  # of the first samples, which are no mirror images; as the next
+    old_mean: wp.array2d[float],  # of samples that are no mirror images, which come first; likewise the next
     old_std: wp.array2d[float],
     clip: float,
     of_mean: wp.array2d[float],
-    # (B, A + 2): by which the std's gradient is the sum, the surrogate loss, the KL divergence
+    # (B, A + 2): terms of the std's gradient, the surrogate loss, the KL divergence
     terms: wp.array2d[float],
 ):
     i = wp.tid()
@@ -177,11 +177,11 @@ def policy_loss(
 
 @wp.kernel(enable_backward=False)
 def policy_sums(
-    sums: wp.array[float],  # (A + 2,) of the terms over all samples
+    sums: wp.array[float],  # (A + 2,) over all samples
     std: wp.array[float],
     entropy_coef: wp.array[float],
     rows: float,
-    size: float,  # of the samples that are no mirror images
+    size: float,  # number of samples that are no mirror images
     of_std: wp.array[float],
     parts: wp.array[float],  # surrogate loss, entropy, KL divergence
 ):

@@ -1,17 +1,15 @@
-"""What ``mujoco_warp.step`` computes and nothing here reads, left out of it: the same state, bit for bit, in less time.
+"""Skip the mujoco_warp kernels that compute nothing that is read. The state stays bit-identical.
 
-The library launches each of its kernels through ``warp.launch`` or ``warp.launch_tiled``. While a substep runs or is recorded,
-these two pass over the kernels that are named here, and ``array.zero_`` over arrays that are zero anyway. So nothing of the
-library is edited or copied, and a kernel that is called otherwise one day is launched as before. ``KNOWN`` names the versions
-that were looked at; another's step runs whole. tests/fast/test_shortcuts.py compares both.
+mujoco_warp launches its kernels through ``warp.launch`` and ``warp.launch_tiled``. While a substep runs or is recorded,
+these two skip the kernels named here, and ``array.zero_`` skips arrays that are already zero. The library itself is not
+changed, and a kernel with an unknown name is launched. ``KNOWN`` lists the tested versions; with another version
+nothing is skipped. tests/fast/test_shortcuts.py compares the steps.
 
-What then holds what was there before: ``qacc_smooth`` and the factorized inertia, ``qfrc_constraint``, ``solver_niter``, the
-overflow bit ITERATIONS, states of constraint rows; in substeps without sensors also forces of constraint rows, places of sites,
-the world's centre of mass, and ``sensordata``.
+Stale after a step: ``qacc_smooth``, the factorized inertia, ``qfrc_constraint``, ``solver_niter``, the overflow bit
+ITERATIONS, states of constraint rows. After a substep without sensors also: forces of constraint rows, positions of
+sites, the world's centre of mass, ``sensordata``.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import threading
@@ -26,18 +24,18 @@ import warp as wp
 from legged_mw.fast.contact_count import count_contacts
 
 KNOWN = ("4.0.0",)  # of mujoco-warp
-_ALONE = threading.RLock()  # warp.launch is everybody's
-# of an iteration, of a solve: the last but for its end
+_ALONE = threading.RLock()  # warp.launch is shared by all threads
+# the line search of an iteration; the last kernel of a solve
 _SEARCH, _SOLVED = "_linesearch_iterative_kernel", "_qfrc_constraint_from_grad"
-# what follows the search, and sensors read: forces of constraint rows
+# kernels after the line search with results that sensors read: forces of constraint rows
 _FORCES = ("_zero_change_counters", "_update_constraint_efc")
 
 
 class Shortcuts:
-    """What is left out of the steps of one model: ``with shortcuts(sensed): mujoco_warp.step(...)``.
+    """The kernels to skip in steps of one model: ``with shortcuts(sensed): mujoco_warp.step(...)``.
 
-    After the last Newton iteration's line search the acceleration stands; the library goes on to the gradient, the Hessian
-    and its factors, for a direction that would be the next iteration's.
+    The line search of the last Newton iteration gives the final acceleration. The library then still computes gradient,
+    Hessian and factors for a next iteration; these are skipped.
     """
 
     def __init__(
@@ -45,7 +43,7 @@ class Shortcuts:
     ) -> None:
         option, kinds = model.opt, mujoco.mjtSensor
         known = mjw.__version__ in KNOWN
-        # a world without constraint rows reaches the same acceleration in its first iteration, to float32 rounding
+        # a world without constraint rows gets the same acceleration from its first iteration, to float32 rounding
         if known:
             option.run_qacc_smooth = False
         plain = (
@@ -58,12 +56,12 @@ class Shortcuts:
         )
         self._iterations = option.iterations if known and plain and not option.graph_conditional else 0
         self._idle, self._idle_unsensed, self._idle_later = set(), set(), set()
-        self._zero: set[int] = set()  # addresses of arrays that are zero, and are set to zero in every substep
+        self._zero: set[int] = set()  # addresses of arrays that stay zero but are cleared in every substep
         self._sensordata = data.sensordata.ptr
         if not known:
             return
         sensors, joints_alone = set(mj.sensor_type), set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}
-        self._idle_later.add("_cacc_world")  # gravity, as before
+        self._idle_later.add("_cacc_world")  # gravity, which does not change
         self._idle_unsensed.add("_subtree_com_world")
         if not mj.body_gravcomp.any() and "body_gravcomp" not in world_fields:
             self._idle.add("_gravity_force")
@@ -79,27 +77,32 @@ class Shortcuts:
             and not option.enableflags & mjw.EnableBit.ENERGY
         ):
             self._zero.add(data.energy.ptr)
-        # reduced to none, or to the net force
+        # contact sensors without reduction, or reduced to the net force
         if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:
             self._idle.add("_contact_sort")
         if not mj.ntendon and not mj.neq and joints_alone:
             self._idle_unsensed.add("_site_local_to_global")
-        if self._iterations == 1:  # what it sets is read by the test of convergence, and by further iterations
+        if self._iterations == 1:  # only the convergence test and later iterations read its result
             self._idle.add("_update_gradient_zero_grad_dot")
 
     @contextmanager
     def __call__(self, sensed: bool, later: bool = False) -> Iterator[None]:
-        """``sensed``: this substep computes sensors. ``later``: it follows another one, with nothing in between."""
+        """``sensed``: this substep computes sensors. ``later``: it directly follows another substep."""
         idle = self._idle | (set() if sensed else self._idle_unsensed) | (self._idle_later if later else set())
         skip = _Skip(idle, self._iterations, _FORCES if sensed else ())
         zero = wp.array.zero_
         kept = self._zero if sensed or not self._zero else self._zero | {self._sensordata}
         with _ALONE:
             whole = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+
+            def clear(array: wp.array) -> None:
+                if array.ptr not in kept:
+                    zero(array)
+
             try:
                 for name, launch in whole.items():
                     setattr(wp, name, skip.around(launch))
-                wp.array.zero_ = lambda array: None if array.ptr in kept else zero(array)
+                wp.array.zero_ = clear  # pyright: ignore[reportAttributeAccessIssue]
                 yield
             finally:
                 wp.array.zero_ = zero
@@ -108,7 +111,7 @@ class Shortcuts:
 
 
 class ShortStep:
-    """``mujoco_warp.step`` of one model with what is left out of it, and with contacts counted by a kernel of our own."""
+    """``mujoco_warp.step`` of one model without the skipped kernels, and with our own kernel that counts contacts."""
 
     def __init__(
         self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()
@@ -126,7 +129,7 @@ class ShortStep:
 
 
 class _Skip:
-    """Which launches of one step are passed over."""
+    """Decides which launches of one step are skipped."""
 
     def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str]) -> None:
         self._idle, self._iterations, self._keep = idle, iterations, keep

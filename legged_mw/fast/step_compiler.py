@@ -1,4 +1,4 @@
-"""From a step as it is written to the same step fused: traced, compiled, and held against the original before it is used."""
+"""Fuse a step: trace it, compile it, and compare it with the original before it is used."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.fast.trace import Call, Trace, alike
 
-_WORTH = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
-_CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison
+_WORTH = 5_000  # control steps, below which compiling on a CPU (seconds, once a machine) does not pay
+_CLOSE, _STRAYS = (
+    1e-3,
+    0.01,
+)  # tolerance and share of outliers of a step's writes: physics amplifies rounding, and a comparison may flip
 
 
 def fuse(env: RobotTask, steps: int) -> None:
-    """Fuse the step of ``env``, which is to make so many ``steps``: on a CPU now, if that pays; on a GPU before it is recorded."""
+    """Fuse the step of ``env``: on a CPU now, if it pays over ``steps``; on a GPU before it is recorded."""
     if not env.cfg.sim.fuse or env.eager:
         return
     if str(env.device) != "cpu":
@@ -28,7 +31,7 @@ def fuse(env: RobotTask, steps: int) -> None:
 
 
 def fused_step(env: RobotTask) -> Callable[[], None]:
-    """The step of ``env`` fused, if that can be; no world moves and no number is drawn."""
+    """The fused step of ``env``, or the original. No world moves and no number is drawn."""
     state = env.sim.memory()
     fields = [value for name, value in state.items() if name.startswith("model.")] if env.sim.engine == "mujoco" else []
     return fused(env._step, env.num_envs, everything(env), fields)
@@ -37,7 +40,7 @@ def fused_step(env: RobotTask) -> Callable[[], None]:
 def fused(
     fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor] = ()
 ) -> Callable[[], None]:
-    """The step ``fn`` of ``worlds``, fused; or ``fn`` itself, and a line says why. No world has moved when it returns.
+    """Fuse the step ``fn`` of ``worlds``; if that fails, print why and return ``fn``. In the end no world has moved.
 
     ``memory`` is all that ``fn`` writes, by name. Only torch may write to what is ``watched``.
     """
@@ -45,7 +48,7 @@ def fused(
     try:
         put_back = remember(memory)
         program, reason = _fused(fn, worlds, memory, watched, put_back), ""
-    except Exception as error:  # whatever a compiler may throw, or no room for a copy: the step goes on as it is
+    except Exception as error:  # an error of any compiler, or no memory for a copy: keep the original step
         program, reason = None, " ".join(f"{error}".split())[:200] or type(error).__name__
     if put_back:
         put_back()
@@ -73,7 +76,7 @@ def _fused(
     if wrong := program.verify():
         print(f"{wrong} of {len(program.parts)} parts of the step are not fused: they gave other values", flush=True)
     put_back()
-    for block in trace.made:  # each is written anew
+    for block in trace.made:  # the step writes each before it reads it
         trace.blocks[block].fill_(float("nan") if trace.blocks[block].is_floating_point() else 1)
     other, calls = set[str](), iter(trace.calls)
 
@@ -103,10 +106,10 @@ def _fused(
 
 
 class _Recorder(Trace):
-    """A trace that also keeps what of ``memory`` each call of the simulator changed, before and after it.
+    """A trace that also keeps the parts of ``memory`` that each call of the simulator changes, before and after it.
 
-    A simulator need not do the same twice: on a GPU chance orders contacts, and decides which are lost where there is no room.
-    So a fused step is compared between its calls, and goes on from what they did the first time.
+    A simulator may not repeat: on a GPU contacts come in random order, and an overflow drops random ones. So a fused
+    step is compared between these calls, and each call's recorded result replaces the call.
     """
 
     def __init__(self, memory: Mapping[str, Tensor], watched: Iterable[Tensor]) -> None:
@@ -125,14 +128,14 @@ class _Recorder(Trace):
 
 
 def remember(memory: Mapping[str, Tensor]) -> Callable[[], None]:
-    """Remember ``memory`` and torch's generators; returns what puts them back."""
+    """Save ``memory`` and torch's generators; returns a function that restores them."""
     kept, draws = {name: value.clone() for name, value in memory.items()}, torch.get_rng_state()
     device = next(iter(memory.values())).device
     draws_there = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
 
     def put_back() -> None:
         for name, value in kept.items():
-            if not torch.equal(memory[name], value):  # what no step writes is not counted as written
+            if not torch.equal(memory[name], value):  # unchanged memory must not count as written
                 memory[name].copy_(value)
         torch.set_rng_state(draws)
         if draws_there is not None:

@@ -1,6 +1,6 @@
-"""What a step does, written down: torch's operations on memory, in order, and calls of the simulator between them.
+"""Trace a step: torch's operations on memory, in order, and the calls of the simulator between them.
 
-A trace is taken of one real call. What it did is known by addresses, so views cost nothing and a write in place is just a write.
+The trace records one real call. It identifies memory by address, so views cost nothing and a write in place is a write.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from legged_mw.utils.opaque import traces
 
 
 class View(NamedTuple):
-    """Where a tensor lies: in a block of memory, with shape, strides and offset in elements."""
+    """A tensor's place: a block of memory, shape, strides and offset in elements."""
 
     block: int
     dtype: torch.dtype
@@ -27,7 +27,7 @@ class View(NamedTuple):
 
 
 class Node(NamedTuple):
-    """An operation as it was called, what it read and what it wrote."""
+    """A node: an operation with its arguments, the memory that it reads and the memory that it writes."""
 
     func: Any  # torch's OpOverload
     args: tuple[Any, ...]
@@ -38,37 +38,37 @@ class Node(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As torch calls it, without what says where the result goes: ``add`` for ``add_`` and ``add.out``."""
+        """torch's name without the form of its output: ``add`` for ``add_`` and ``add.out``."""
         return self.func._schema.name.removeprefix("aten::").strip("_") if hasattr(self.func, "_schema") else ""
 
     @property
     def random(self) -> bool:
-        """It draws from the generator."""
+        """Whether it draws from the generator."""
         return torch.Tag.nondeterministic_seeded in self.func.tags
 
 
 class Call(NamedTuple):
-    """A call that is not looked into, and the blocks of memory that it is given."""
+    """An opaque call, and the blocks of memory that it is given."""
 
     run: Callable[[], object]
     given: tuple[int, ...]
 
 
 class Trace(TorchDispatchMode):
-    """Used with ``with``: notes every operation, and runs it."""
+    """A context manager that records every operation and runs it."""
 
     def __init__(self, watched: Iterable[Tensor] = ()) -> None:
-        """``watched``: memory whose writes others notice by torch's count of them, so that only torch may write to it."""
+        """``watched``: only torch may write this memory, since others detect writes by torch's version counter."""
         super().__init__()
         self.steps: list[Node | Call] = []
-        self.blocks: list[Tensor] = []  # a tensor of each block of memory, which keeps it where it is
-        self.made: set[int] = set()  # blocks that were made meanwhile
+        self.blocks: list[Tensor] = []  # a tensor of each block of memory, which keeps it allocated
+        self.made: set[int] = set()  # blocks that were allocated during the trace
         self._known: dict[int, int] = {}
         self.watched = {self.view(tensor).block for tensor in watched}
         self._paused = False
 
     def view(self, tensor: Tensor, made: bool = False) -> View:
-        """Where ``tensor`` lies. Its memory is kept from now on."""
+        """The place of ``tensor``. Its memory is kept allocated."""
         address = tensor.untyped_storage().data_ptr()
         if address not in self._known:
             self._known[address] = len(self.blocks)
@@ -92,7 +92,7 @@ class Trace(TorchDispatchMode):
         if not written:
             blocks = {view.block for view in reads}
             fresh = [t for t in outs if t.numel() and self._known.get(t.untyped_storage().data_ptr(), -1) not in blocks]
-            if not fresh:  # a view, or nothing at all
+            if not fresh:  # a view, or no output
                 return result
             outs = tuple(fresh)
         writes = tuple(self.view(tensor, made=not written) for tensor in written or outs)
@@ -100,7 +100,7 @@ class Trace(TorchDispatchMode):
         return result
 
     def call(self, run: Callable[[], object], given: Iterable[Tensor] = ()) -> Any:
-        """Run what is not looked into; of what the trace made it reads what it is ``given``. A tensor that it returns is kept."""
+        """Run an opaque call; of the trace's own memory it may read what it is ``given``. A returned tensor is kept."""
         self._paused = True
         try:
             result = run()
@@ -115,7 +115,7 @@ class Trace(TorchDispatchMode):
         return result
 
     def call_whole(self, method: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a method that is marked with ``not_traced``."""
+        """Run a method marked ``not_traced``."""
         if self._paused:
             return method(*args, **kwargs)
         return self.call(lambda: method(*args, **kwargs), _tensors((args, kwargs)))
@@ -135,7 +135,7 @@ def _tensors(nested: Any) -> Iterator[Tensor]:
 
 
 def _written(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Iterator[Tensor]:
-    """The tensors among the arguments that ``func`` writes to."""
+    """The tensor arguments that ``func`` writes."""
     for i, argument in enumerate(func._schema.arguments):
         if argument.alias_info is not None and argument.alias_info.is_write:
             yield from _tensors(args[i] if i < len(args) else kwargs.get(argument.name))

@@ -18,12 +18,24 @@ import numpy as np
 from legged_mw.robot.meshes import compile_readable
 from legged_mw.robot.mjcf import Source, check_model
 from legged_mw.robot.urdf import read_urdf
-from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, UPRIGHT, Keyframe, RobotFile, kind_of, naming, tilt
-from legged_mw.sim.servos import take_limits
+from legged_mw.sim.robot_file import (
+    SCALAR_JOINTS,
+    SCENE,
+    UPRIGHT,
+    Keyframe,
+    Range,
+    RobotFile,
+    is_limited,
+    joint_limits,
+    kind_of,
+    naming,
+    tilt,
+)
 from legged_mw.utils.errors import ModelError
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
+_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _ADDED = {  # attributes of defaults that would apply to what is added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
@@ -45,7 +57,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         source = Source(file)
         spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
-        limits = take_limits(spec, notes)
+        limits = _take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
         sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
         _drop_sensors(spec, wanted, notes)
@@ -71,6 +83,33 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
         for body in spec.bodies[1:]:
             for name in ("explicitinertial", "mass", "ipos", "iquat", "inertia", "fullinertia"):
                 setattr(body, name, getattr(fresh, name))
+
+
+def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
+    """Joint -> lowest and highest force at the joint [N m]; the file's actuators are removed.
+
+    A joint's own range wins; next an actuator's forcerange through its gear; last a motor's ctrlrange through gain and gear.
+    """
+    limits = joint_limits(spec)
+    if actuators := list(spec.actuators):
+        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced")
+    for actuator in actuators:
+        if actuator.trntype in _JOINTS and actuator.target not in limits:
+            force = _force(actuator)
+            if force is not None:
+                limits[actuator.target] = (float(min(force)), float(max(force)))
+        spec.delete(actuator)
+    return limits
+
+
+def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
+    """An actuator's force range at the joint [N m]; None if it has none, or if only a simulation can tell."""
+    if is_limited(actuator.forcelimited, actuator.forcerange):
+        return actuator.forcerange * actuator.gear[0]
+    is_motor = actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
+    if is_motor and is_limited(actuator.ctrllimited, actuator.ctrlrange):
+        return actuator.ctrlrange * actuator.gear[0] * actuator.gainprm[0]
+    return None
 
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:

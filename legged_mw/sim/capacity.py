@@ -1,10 +1,8 @@
-"""How many contacts (``nconmax``) and constraint rows (``njmax``) a world needs on mujoco-warp, counted from the model.
+"""Count the contacts (``nconmax``) and constraint rows (``njmax``) that a world needs on mujoco-warp.
 
-mujoco-warp allocates them at the start. Too few: contacts are dropped and reported. Too many rows cost memory and time.
+mujoco-warp allocates them once. With too few it drops contacts and reports it; too many rows cost memory and time.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -20,12 +18,12 @@ _TYPE, _EQUALITY = mujoco.mjtGeom, mujoco.mjtEq
 _ON_PLANE = {_TYPE.mjGEOM_SPHERE: 1, _TYPE.mjGEOM_ELLIPSOID: 1, _TYPE.mjGEOM_CAPSULE: 2}  # others lie on a face: 4
 _ROWS = {1: 1, 3: 4, 4: 6, 6: 10}  # of a contact with a pyramidal cone, by condim
 _EQUALITY_ROWS = {_EQUALITY.mjEQ_CONNECT: 3, _EQUALITY.mjEQ_WELD: 6}  # others: 1
-_LEAST = 8  # contacts, which cost little: worlds share the room of all, rows they do not
-_REST = 0.25  # ours: share of the contacts of links between the root and the last ones, which rarely touch all at once
+_LEAST = 8  # contacts; they cost little, since all worlds share one buffer of them
+_REST = 0.25  # ours: share of the contacts that links other than the last make at once
 
 
 class Capacity(NamedTuple):
-    """Contacts and rows of one world, and what they were counted from."""
+    """Contacts and rows of one world, and where they come from."""
 
     contacts: int
     rows: int
@@ -33,11 +31,10 @@ class Capacity(NamedTuple):
 
 
 def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
-    """What ``model`` needs on its plane, or on ``terrain``.
+    """The capacity that ``model`` needs on its plane, or on ``terrain``.
 
-    Assumed: the last link of a limb touches with all its contacts, other links with a quarter of theirs. Each joint with dry
-    friction or limits takes a row. If parts of the robot may touch one another, half of them do, and as many again are near,
-    which takes a contact too.
+    Assumed: the last link of a limb touches with all its contacts, other links with a quarter. Dry friction and limits
+    take a row a joint. With self-collisions half of the geoms touch another, and as many are near one, a contact too.
     """
     geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] and model.geom_conaffinity[geom] & 1]
     last = _last_links(model, {int(model.geom_bodyid[geom]) for geom in geoms})
@@ -56,7 +53,7 @@ def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
 
 
 def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
-    """Those of ``bodies`` that carry no other one of them."""
+    """Those of ``bodies`` that carry no other of them."""
     above: set[int] = set()
     for body in bodies:
         while (body := int(model.body_parentid[body])) > 0:
@@ -65,7 +62,7 @@ def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
 
 
 def _contacts(model: mujoco.MjModel, geom: int, terrain: bool) -> int:
-    """The most contacts of ``geom`` with the ground. On terrain: two of a sphere, in a corner; of other shapes one a probe of one side."""
+    """The most contacts of ``geom`` with the ground. On terrain: two of a sphere, else one a probe of one side."""
     kind = _TYPE(model.geom_type[geom])
     plane = _ON_PLANE.get(kind, 4)
     if not terrain:

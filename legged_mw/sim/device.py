@@ -1,4 +1,4 @@
-"""What warp and CUDA offer on a device, and what makes a start slow there. For messages: nothing steps by it."""
+"""Facts of a device for messages: what CUDA supports, how much memory is taken, which kernels are compiled."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import torch
 
-GRAPHS_SINCE = (12, 4)  # CUDA of the driver: below, mujoco-warp warns that recording may be unreliable
-_OTHERS = 1.0  # GiB on a GPU: a desktop takes less, a training more
-# [s] after which compiled kernels are looked for; a start that compiles none is over before the first
+GRAPHS_SINCE = (12, 4)  # CUDA version of the driver; mujoco-warp warns that with older ones recording may be unreliable
+_OTHERS = 1.0  # GiB on a GPU: a desktop takes less, a training takes more
+# [s] between checks for newly compiled kernels; a start that compiles none ends before the first
 _WAITS = (6.0, 6.0, 12.0)
 
 
@@ -21,21 +21,20 @@ class DeviceFacts(NamedTuple):
     """A device as warp sees it; memory in GiB."""
 
     name: str
-    cuda: tuple[int, int] | None  # what the driver supports
+    cuda: tuple[int, int] | None  # version that the driver supports
     pool: bool  # memory can be allocated while a graph is recorded
-    cache: Path  # of compiled kernels
-    compiled: int  # modules of kernels in it for this device
+    cache: Path  # folder of compiled kernels
+    compiled: int  # kernel modules in it for this device
     memory: float = 0.0
     taken: float = 0.0  # by all processes
-    binaries: str = ""  # pattern of a module's compiled file
+    binaries: str = ""  # pattern of the name of a compiled file
 
     def slow(self) -> list[str]:
-        """A line a reason for which the first minute, or all of the training, is slow here."""
+        """A line for each reason why the start, or the training, is slow here."""
         lines = []
         if not self.compiled:
-            lines.append(
-                "some 50 modules of kernels are compiled at this first start, a minute or two; `legged-mw warm` does it ahead"
-            )
+            compiling = "some 50 modules of kernels are compiled at this first start, a minute or two"
+            lines.append(f"{compiling}; `legged-mw warm` does it ahead")
         if self.memory and not self.pool:
             lines.append("this GPU has no memory pool: nothing can be recorded, and a step takes several times as long")
         if self.cuda and self.cuda < GRAPHS_SINCE:
@@ -47,13 +46,13 @@ class DeviceFacts(NamedTuple):
         return lines
 
     def compiled_since(self, begun: float) -> int:
-        """Modules of kernels, of any package, that were compiled after ``begun``, a time of the clock [s]."""
+        """Number of kernel modules, of any package, compiled after ``begun`` (``time.time()``)."""
         files = self.cache.glob(f"wp_*/{self.binaries}")
         return len({file.parent for file in files if file.stat().st_mtime >= begun})
 
     @contextmanager
     def say_compiling(self, say: Callable[[str], object] = print, waits: Sequence[float] = _WAITS) -> Iterator[Thread]:
-        """Inside, say once, from a thread, that what is done waits for kernels. An empty cache is told of by ``slow``."""
+        """While inside, a thread says once if kernels are being compiled. ``slow`` already reports an empty cache."""
         begun, over = time.time(), Event()
 
         def watch() -> None:
@@ -61,9 +60,8 @@ class DeviceFacts(NamedTuple):
                 if over.wait(seconds):
                     return
                 if count := self.compiled_since(begun):
-                    say(
-                        f"kernels that this task needs are being compiled, {count} modules so far; the next start has them"
-                    )
+                    text = f"kernels that this task needs are being compiled, {count} modules so far"
+                    say(f"{text}; the next start has them")
                     return
 
         thread = Thread(target=watch, daemon=True)
@@ -75,8 +73,8 @@ class DeviceFacts(NamedTuple):
 
 
 def device_facts(device: str) -> DeviceFacts:
-    """Ask warp and CUDA. Ask before anything is allocated: what this process holds would count as taken."""
-    import warp as wp  # a second to import, and MuJoCo's own engine needs none of it
+    """The facts of ``device``. Call it before this process allocates memory there, which would count as taken."""
+    import warp as wp  # here, because importing warp takes a second
 
     wp.config.log_level = wp.LOG_WARNING
     wp.init()

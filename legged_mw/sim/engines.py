@@ -1,7 +1,5 @@
-"""Which engine steps: ``mujoco_warp`` on a GPU, or on a CPU through warp; ``mujoco``, MuJoCo's own, on a thread pool of the CPU."""
+"""Choose the engine: ``mujoco_warp`` on a GPU (slow on a CPU), or ``mujoco``, MuJoCo's own, on threads of a CPU."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -15,22 +13,21 @@ from legged_mw.utils.errors import EngineError, unknown
 from legged_mw.utils.machine import in_bytes, require_memory
 
 ENGINES = ("auto", "mujoco_warp", "mujoco")
-# Bytes of a world, of those of an MjData, at the least: measured 0.21 (a Go1), 0.52 (a G1) and 1.3 (rough ground) on MuJoCo's own
-# engine, 1.1 and 1.3 on mujoco-warp, which has its room for contacts and rows besides.
+# Least bytes of a world, as a share of an MjData's. Measured on MuJoCo's own engine: 0.21 (Go1), 0.52 (G1), 1.3 (rough
+# ground); on mujoco-warp 1.1 and 1.3, without its buffers for contacts and rows.
 _SHARE = {"mujoco": 0.2, "mujoco_warp": 1.0}
 
 
-def pick_engine(asked: str, device: str) -> str:
-    """The engine that ``asked`` means on ``device``: "auto" is MuJoCo's own on a CPU and mujoco-warp on a GPU."""
-    if asked not in ENGINES:
-        raise EngineError(unknown("engine", asked, ENGINES, "the list of engines"))
-    if asked == "auto":
+def pick_engine(name: str, device: str) -> str:
+    """Resolve "auto": MuJoCo's own engine on a CPU, mujoco-warp on a GPU. Raises EngineError if the two do not fit."""
+    if name not in ENGINES:
+        raise EngineError(unknown("engine", name, ENGINES, "the list of engines"))
+    if name == "auto":
         return "mujoco" if device == "cpu" else "mujoco_warp"
-    if asked == "mujoco" and device != "cpu":
-        raise EngineError(
-            f"the engine mujoco steps on a CPU, and the device is {device}; take the device cpu, or the engine mujoco_warp"
-        )
-    return asked
+    if name == "mujoco" and device != "cpu":
+        text = f"the engine mujoco steps on a CPU, and the device is {device}"
+        raise EngineError(f"{text}; take the device cpu, or the engine mujoco_warp")
+    return name
 
 
 def make_simulation(
@@ -48,11 +45,10 @@ def make_simulation(
 ) -> Simulation:
     """Allocate ``num_envs`` worlds of ``model`` on ``device``.
 
-    ``terrain`` is what the model's height field was made from: mujoco-warp has our own contacts with it
-    (``sim/ground_contact.py``), MuJoCo's own engine those of the model. ``nconmax`` and ``njmax`` are the contacts and
-    constraint rows of a world on mujoco-warp, 0: counted (``sim/capacity.py``). ``threads`` are those of MuJoCo's own engine,
-    0: one a core. ``world_fields`` names model fields that get a value per world (see ``field``). ``eager`` switches
-    mujoco-warp's replay on a CPU off.
+    ``terrain``: source of the model's height field; on mujoco-warp our own contacts replace that field's.
+    ``nconmax``, ``njmax``: contacts and constraint rows of a world on mujoco-warp; 0: counted (``sim/capacity.py``).
+    ``threads``: of MuJoCo's own engine; 0: one a core. ``world_fields``: model fields with a value per world (see
+    ``field``). ``eager``: mujoco-warp does not record its kernels on a CPU.
     """
     kind = pick_engine(engine, device)
     world, room = _SHARE[kind] * mujoco.MjData(model).nbuffer, ""
@@ -64,7 +60,7 @@ def make_simulation(
     require_memory(
         num_envs * world, device, f"num_envs = {num_envs}", f"a world takes {in_bytes(world)}{room}; take fewer"
     )
-    # each engine is imported where it steps: importing warp takes a second
+    # imported here, because importing warp takes a second
     if kind == "mujoco":
         from legged_mw.sim.mujoco_engine import MujocoSimulation
 

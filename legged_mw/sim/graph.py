@@ -1,4 +1,4 @@
-"""Recording a fixed sequence of work once and replaying it as a CUDA graph."""
+"""Record a fixed sequence of work once, and replay it as a CUDA graph."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from legged_mw.utils.errors import NotRecordable, line_to_blame, out_of_memory
 class StepGraph:
     """Calls ``fn``; on a GPU every call after the first three replays one CUDA graph of torch and warp work together.
 
-    ``fn`` may touch only tensors that outlive it, in place, and may not ask the host for a value.
-    The first calls are real ones: they compile kernels and warm the allocators, and no step is thrown away.
+    ``fn`` may only write tensors in place that outlive it, and may not copy a value to the host.
+    The first calls are real ones: they compile kernels and warm the allocators, and no step is wasted.
     """
 
-    # asked once, before recording, for what does the same in fewer kernels
+    # called once, before recording; returns a function that does the same in fewer kernels
     better: Callable[[], Callable[[], None]] | None = None
 
     def __init__(self, fn: Callable[[], None], device: str, eager: bool = False, warmup: int = 3) -> None:
@@ -28,11 +28,11 @@ class StepGraph:
 
     @property
     def recorded(self) -> bool:
-        """Whether calls are replays by now."""
+        """Whether calls are replays now."""
         return self._graph is not None
 
     def improve(self, fn: Callable[[], None]) -> None:
-        """Call ``fn`` from now on, which does the same."""
+        """Replace the function by ``fn``, which does the same."""
         self._fn = fn
 
     def __call__(self) -> None:
@@ -44,10 +44,10 @@ class StepGraph:
             self._first_calls(self._stream)
 
     def _first_calls(self, stream: torch.cuda.Stream) -> None:
-        """Eager while warming up, then record and replay; all on one side stream, as capture demands."""
+        """Run eagerly while warming up, then record and replay; all on one side stream, as capture requires."""
         import warp as wp  # a second to import, and only for a GPU
 
-        wp.init()  # which is nothing where a simulation has done so
+        wp.init()  # no effect if a simulation did so
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
         wp_stream = wp.stream_from_torch(stream)
@@ -65,9 +65,9 @@ class StepGraph:
         self._graph.replay()
 
     def _record(self, stream: torch.cuda.Stream, wp: Any, wp_stream: Any) -> torch.cuda.CUDAGraph:
-        """The graph of one call. Raises NotRecordable with the line of ``fn`` that failed, not with what then failed to end."""
+        """The graph of one call. Raises NotRecordable with the line of ``fn`` that failed, not a later error."""
         graph, failed, collects = torch.cuda.CUDAGraph(), None, gc.isenabled()
-        gc.disable()  # an older graph that it frees meanwhile would end the recording
+        gc.disable()  # freeing an older graph would abort the recording
         try:
             with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
                 wp.capture_begin(stream=wp_stream, external=True)
@@ -91,5 +91,5 @@ class StepGraph:
 
 def _refused(error: RuntimeError) -> NotRecordable:
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    what = f"cannot be recorded for a GPU ({reason}); a recorded step asks the host for no value, copies none, and has fixed shapes"
-    return NotRecordable(what, line_to_blame(error)[0])
+    rule = "a recorded step asks the host for no value, copies none, and has fixed shapes"
+    return NotRecordable(f"cannot be recorded for a GPU ({reason}); {rule}", line_to_blame(error)[0])

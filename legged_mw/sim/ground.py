@@ -1,7 +1,5 @@
-"""The ground that is added to a robot's MJCF: a plane, or the height field of a terrain, with its contact parameters."""
+"""Add the ground to a robot's MJCF: a plane or the height field of a terrain, with its contact parameters."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math
@@ -16,7 +14,7 @@ from legged_mw.sim.terrain import LEVEL, Heights, Terrain
 
 GROUND = "floor"  # name of the ground geom
 PROBE_SPACING = 0.1  # [m] between the spheres by which one geom touches terrain on mujoco-warp
-MOST_BOXES = 1000  # of a tile; what needs more stays a height field
+MOST_BOXES = 1000  # a tile that needs more stays a height field
 
 
 @dataclass(frozen=True)
@@ -26,8 +24,8 @@ class Ground:
     friction: float = 0.6  # sliding [-]
     condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
     terrain: Terrain | None = None  # None: the plane
-    boxes: bool = False  # level pieces of the terrain as boxes, in what is stepped: for MuJoCo's own engine
-    slope: float = 0.0  # [deg] by which gravity leans from -z to x: the plane slopes down along x, and stays z = 0
+    boxes: bool = False  # level pieces of the terrain become boxes in the physics: for MuJoCo's own engine
+    slope: float = 0.0  # [deg] by which gravity leans from -z to x, as on a plane that slopes down along x
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
@@ -57,7 +55,7 @@ def leaning(gravity: Sequence[float], slope: float) -> list[float]:
 def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) -> None:
     """Put ``heights`` (R, C) [m] on the grid of ``terrain``."""
     low, (rows, columns) = float(heights.min()), heights.shape
-    span = max(float(np.ptp(heights)), 1e-3)  # MuJoCo wants some; it scales what it is given to 0..1
+    span = max(float(np.ptp(heights)), 1e-3)  # MuJoCo scales the heights to 0..1, and needs a span above 0
     field = spec.hfield(GROUND)
     field.size = [(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, span, 1.0]
     field.userdata = ((heights - low) / span).astype(np.float32).ravel()
@@ -67,8 +65,8 @@ def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) 
 def replace_level_pieces(spec: mujoco.MjSpec, terrain: Terrain, notes: list[str]) -> None:
     """Replace the level pieces of the height field by boxes, and sink the field under them.
 
-    MuJoCo makes a tilted contact with every triangle near a geom: a small sphere has up to a dozen on a height field, and few
-    iterations leave them far from solved.
+    On a height field MuJoCo makes a tilted contact with every triangle near a geom, up to a dozen for a small sphere.
+    Few solver iterations leave them far from solved.
     """
     boxes, heights, _ = as_boxes(terrain)
     _fill_height_field(spec, terrain, heights)
@@ -84,28 +82,26 @@ def replace_level_pieces(spec: mujoco.MjSpec, terrain: Terrain, notes: list[str]
 
 
 def add_ground_box(spec: mujoco.MjSpec, low: np.ndarray, high: np.ndarray) -> mujoco.MjsGeom:
-    """A box between two corners (3,) [m] that touches as the ground does."""
-    box, floor = (
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2, size=(high - low) / 2),
-        spec.geom(GROUND),
-    )
+    """Add a box between two corners (3,) [m], with the contact parameters of the ground."""
+    floor, box_type = spec.geom(GROUND), mujoco.mjtGeom.mjGEOM_BOX
+    box = spec.worldbody.add_geom(type=box_type, pos=(low + high) / 2, size=(high - low) / 2)
     for name in ("contype", "conaffinity", "priority", "condim", "friction", "solref", "solimp"):
         setattr(box, name, getattr(floor, name))
     return box
 
 
 def feel_all_ground(spec: mujoco.MjSpec) -> None:
-    """Let contact sensors of the ground's geom sense all geoms of the world instead."""
+    """Let sensors of contact with the ground's geom sense all geoms of the world body."""
     for sensor in spec.sensors:
         if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.refname == GROUND:
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
 
 
-# ---- level pieces of a terrain as boxes: MuJoCo makes one upright contact with a box ----
+# ---- level pieces of a terrain as boxes: with a box MuJoCo makes one upright contact
 
 
 class Box(NamedTuple):
-    """A block of ground whose top is level."""
+    """A block of ground with a level top."""
 
     low: tuple[float, float]  # corner x, y [m, world]
     high: tuple[float, float]  # the opposite one
@@ -113,9 +109,9 @@ class Box(NamedTuple):
 
 
 def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
-    """Boxes for the tiles that are few level pieces; the heights, sunk by 1 m under the boxes; the kinds that stay a height field.
+    """Boxes for tiles of few level pieces; the heights, 1 m lower under the boxes; the kinds that stay a height field.
 
-    Steps are upright there, midway between the vertices where the height field has a slope of one cell.
+    A box ends midway between two vertices, where the height field has a slope of one cell.
     """
     heights, boxes, left = terrain.heights.copy(), [], set()
     n = round(terrain.tile / terrain.cell)
@@ -127,10 +123,8 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
             left.add(kind)
             continue
         for rows, columns, top in pieces:
-            y, x = (
-                tile.start + np.clip([*span], 0.5, n + 0.5) - 0.5
-                for tile, span in zip(where, (rows, columns), strict=True)
-            )
+            y = where[0].start + np.clip(rows, 0.5, n + 0.5) - 0.5
+            x = where[1].start + np.clip(columns, 0.5, n + 0.5) - 0.5
             low, high = zip(terrain.corner[0] + x * terrain.cell, terrain.corner[1] + y * terrain.cell, strict=True)
             boxes.append(Box(low, high, top))
         inside = heights[where][1:-1, 1:-1]
@@ -139,7 +133,7 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
 
 
 def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
-    """Rectangles of vertices of one height, as (rows, columns, height), spans half open; it stops above MOST_BOXES."""
+    """Rectangles of vertices of equal height: (rows, columns, height), spans half open. It stops above MOST_BOXES."""
     taken = np.zeros(patch.shape, dtype=bool)
     pieces: list[tuple[tuple[int, int], tuple[int, int], float]] = []
     for row in range(patch.shape[0]):

@@ -1,15 +1,16 @@
-"""A height field in warp: contacts with it, in one kernel called where mujoco-warp would filter its own, and its heights.
+"""Contacts with a height field, and its heights, in warp. One kernel makes them, in mujoco-warp's contact filter.
 
-mujoco-warp 4.0.0 treats a height field as a heap of prisms: a sphere gets a contact from every triangle near it, tilted
-ones at the edges between triangles of one plane, and now and then a deep one where there is none (docs/terrain.md has the
-figures). Here a sphere touches the surface at its nearest point, and at a second one where another face turns away from
-the first, as in the corner of a step. A geom is looked at in probes, which are spheres fixed to it.
+mujoco-warp 4.0.0 treats a height field as many prisms. A sphere gets a contact from every triangle near it, tilted ones
+at edges inside a plane, and sometimes a deep one that is false (figures in docs/terrain.md). Here a sphere touches the
+surface at its nearest point, and at a second point on a face that turns away from the first, as in the corner of a
+step. A geom is sampled by probes, which are spheres fixed to it.
 """
 
-# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
-# pyright: reportArgumentType=false, reportCallIssue=false, reportAssignmentType=false, reportOperatorIssue=false, reportReturnType=false
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportAssignmentType=false
+# pyright: reportOperatorIssue=false, reportReturnType=false
 # ruff: noqa: UP018, SIM102
-# (mujoco ships no type stubs, and warp compiles what it finds written here as its own language: float() makes a variable)
+# (warp compiles this file as its own language: float() makes a variable)
 from __future__ import annotations
 
 import dataclasses
@@ -33,14 +34,14 @@ from legged_mw.utils.opaque import not_traced
 
 wp.set_module_options({"enable_backward": False})
 
-_CORNER_COS = wp.constant(0.9)  # of the angle from which on a second face is another contact: 26 deg
-_DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its surface is looked for
+_CORNER_COS = wp.constant(0.9)  # faces that turn by more than this angle, 26 deg, make two contacts
+_DEEPEST = wp.constant(0.3)  # [m] around a probe under the ground in which the surface is searched
 
 
 def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, list[float]]:
-    """Spheres that stand for what can touch the geom ``ground``: their geoms, places in the geom's frame (P, 3), radii [m].
+    """Spheres on the geoms that can touch the geom ``ground``: geoms, places in the geom's frame (P, 3), radii [m].
 
-    They are ``PROBE_SPACING`` apart at the most, so that a thin edge of the ground may come as far in between.
+    They are at most ``PROBE_SPACING`` apart; a thin edge of the ground may enter a geom between two by as much.
     """
     geoms, places, radii = [], [], []
     for geom in range(model.ngeom):
@@ -65,7 +66,7 @@ def _field(terrain: Terrain) -> Any:
 
 
 class HeightLookup:
-    """``height_map.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
+    """``height_map.HeightMap`` as one kernel for a GPU, where many small operations are slow."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
         self._device = wp.get_device(device)
@@ -74,7 +75,7 @@ class HeightLookup:
 
     @not_traced
     def __call__(self, points: Tensor) -> Tensor:
-        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim."""
+        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field its rim's."""
         heights = torch.empty(points.shape[:-1], device=points.device)
         places = wp.from_torch(points.reshape(-1, 2), dtype=wp.vec2)
         wp.launch(
@@ -88,7 +89,7 @@ class HeightLookup:
 
 
 def touch_ground(model: mujoco.MjModel, ground: int, terrain: Terrain) -> Callable[[mjw.Model, mjw.Data], None]:
-    """What ``Model.callback.contactfilter`` is to be, on the current device. The geom ``ground`` must not collide by itself."""
+    """The ``Model.callback.contactfilter``, on the current device. The geom ``ground`` itself must not collide."""
     geoms, places, radii = probes(model, ground)
     field, spheres = _field(terrain), _Probes()
     spheres.geom, spheres.place, spheres.radius = (
@@ -121,7 +122,7 @@ class _Probes:
 
 
 def _struct(source: type, names: str) -> Any:
-    """Some arrays of a dataclass of mujoco-warp as one argument of a kernel, under its names and with its types."""
+    """Bundle arrays of a mujoco-warp dataclass into one kernel argument, with their names and types."""
     kinds = {field.name: field.type for field in dataclasses.fields(source)}
     return wp.struct(
         type(f"_{source.__name__}", (), {"__annotations__": {name: kinds[name] for name in names.split()}})
@@ -135,12 +136,13 @@ _Material = _struct(
 )
 _Contacts = _struct(
     Contact,
-    "dist pos frame includemargin friction solref solreffriction solimp dim geom efc_address worldid type geomcollisionid adhesion",
+    "dist pos frame includemargin friction solref solreffriction solimp dim geom efc_address worldid type "
+    "geomcollisionid adhesion",
 )
 
 
 def _gather(struct: Any, source: Any) -> Any:
-    """An instance of ``struct`` whose arrays are those of ``source``; nothing is copied."""
+    """A ``struct`` with the arrays of ``source``, not copied."""
     gathered = struct()
     for name in struct.vars:
         setattr(gathered, name, getattr(source, name))
@@ -155,7 +157,7 @@ def _vertex(field: _Field, row: int, column: int) -> wp.vec3:
 
 @wp.func
 def _surface(field: _Field, u: float, v: float) -> float:
-    """Height [m] at column u, row v: triangles, as ``height_map.HeightMap``. What is not finite is somewhere."""
+    """Height [m] at column u, row v, on the triangles of ``HeightMap``; any height if u or v is not finite."""
     column = wp.clamp(int(wp.floor(u)), 0, field.heights.shape[1] - 2)
     row = wp.clamp(int(wp.floor(v)), 0, field.heights.shape[0] - 2)
     across, along = wp.clamp(u - float(column), 0.0, 1.0), wp.clamp(v - float(row), 0.0, 1.0)
@@ -173,7 +175,7 @@ def _look_up(field: _Field, points: wp.array[wp.vec2], heights: wp.array[float])
 
 @wp.func
 def _nearest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
-    """The point of the triangle that is nearest to p [Ericson, Real-Time Collision Detection, 5.1.5]."""
+    """The point of the triangle nearest to p [Ericson, Real-Time Collision Detection, 5.1.5]."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
@@ -223,7 +225,7 @@ def _around(field: _Field, u: float, v: float, reach: float) -> wp.vec4i:
 
 @wp.func
 def _nearest(field: _Field, cells: wp.vec4i, centre: wp.vec3, lowest: float) -> tuple[wp.vec3, float, wp.vec3]:
-    """The surface's nearest point, its distance [m] and its face's normal; cells that lie below ``lowest`` are left out."""
+    """The surface's nearest point, its distance [m] and its face's normal; cells below ``lowest`` are skipped."""
     nearest, distance, up = wp.vec3(0.0, 0.0, 0.0), float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
     for row in range(cells[0], cells[1] + 1):
         for column in range(cells[2], cells[3] + 1):
@@ -242,7 +244,7 @@ def _nearest(field: _Field, cells: wp.vec4i, centre: wp.vec3, lowest: float) -> 
 
 @wp.func
 def _other_face(field: _Field, cells: wp.vec4i, centre: wp.vec3, normal: wp.vec3) -> tuple[float, wp.vec3]:
-    """Distance [m] and normal of the nearest face that turns away from ``normal`` and that the centre is right over."""
+    """Distance [m] and normal of the nearest face that turns away from ``normal`` and has the centre right above it."""
     nearest, direction = float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
     for row in range(cells[0], cells[1] + 1):
         for column in range(cells[2], cells[3] + 1):
@@ -271,7 +273,7 @@ def _write(
     out: _Contacts,
     nacon: wp.array[int],
 ):
-    """One contact, with the parameters that MuJoCo's rules of mixing give it."""
+    """Write one contact, with parameters mixed by MuJoCo's rules."""
     allowance = _margin_and_gap(m, geoms, world)
     # fmt: off
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
@@ -282,15 +284,15 @@ def _write(
     write_contact(
         naconmax, which, depth, place, make_frame(normal), allowance[0], allowance[1],
         condim, friction, solref, solreffriction, solimp, adhesion, geoms, wp.vec2i(-1, -1), world,
-        out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
-        out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion, nacon,
+        out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp,
+        out.dim, out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion, nacon,
     )
     # fmt: on
 
 
 @wp.func
 def _margin_and_gap(m: _Material, geoms: wp.vec2i, world: int) -> wp.vec2:
-    """[m] of a pair."""
+    """Margin and gap of a pair [m]."""
     margins, gaps = m.geom_margin[world % m.geom_margin.shape[0]], m.geom_gap[world % m.geom_gap.shape[0]]
     return wp.vec2(margins[geoms[0]] + margins[geoms[1]], gaps[geoms[0]] + gaps[geoms[1]])
 
@@ -312,7 +314,7 @@ def _touch(
     geoms = wp.vec2i(ground, geom)
     centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ spheres.place[probe]
     allowance = _margin_and_gap(material, geoms, world)
-    farthest = allowance[0] + allowance[1]  # [m] from the surface, that is still a contact
+    farthest = allowance[0] + allowance[1]  # [m] from the surface up to which there is a contact
     u, v = (centre[0] - field.corner[0]) * field.per_cell, (centre[1] - field.corner[1]) * field.per_cell
     above = centre[2] - _surface(field, u, v)  # [m] straight up from the ground; negative: under it
     touching = radius + farthest
@@ -325,12 +327,12 @@ def _touch(
     normal = up
     if distance > 1.0e-6:
         away = side * (centre - nearest) / distance
-        # else it is over a face, whose own normal is more exact than a difference of places
+        # over a face its own normal is more exact than a difference of places
         if wp.dot(away, up) < 0.9999:
             normal = away
     place = centre - normal * (radius + 0.5 * depth)
     _write(world, 0, geoms, depth, place, normal, material, naconmax, contacts, nacon)
-    if above >= 0.0:  # from under the ground there is one way out
+    if above >= 0.0:  # under the ground one contact is enough to push it out
         other, face = _other_face(field, cells, centre, normal)
         depth = other - radius
         if depth < farthest:

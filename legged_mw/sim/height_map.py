@@ -1,4 +1,4 @@
-"""Heights of a terrain at any place, looked up on the device in tensors of fixed shape."""
+"""Look up heights of a terrain on the device, in tensors of fixed shape."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from legged_mw.sim.terrain import Terrain
 
 
 class HeightMap:
-    """The heights of a ``Terrain`` on a device; a lookup is a gather of fixed shape and asks the host nothing."""
+    """The heights of a ``Terrain`` on a device. A lookup is a gather of fixed shape, without the host."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
         self._rows, self._columns = terrain.heights.shape
@@ -20,7 +20,7 @@ class HeightMap:
         self._per_cell = 1.0 / terrain.cell
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim; of NaN, of a corner."""
+        """Ground height [m] at ``points`` (..., 2) [m, world]; outside of the field the rim's, for NaN a corner's."""
         place = ((points - self._corner) * self._per_cell).nan_to_num(0.0)
         u, v = place[..., 0].clamp(0.0, self._columns - 1.0), place[..., 1].clamp(0.0, self._rows - 1.0)
         column, row = u.floor().clamp(max=self._columns - 2.0), v.floor().clamp(max=self._rows - 2.0)
@@ -32,7 +32,7 @@ class HeightMap:
 
 
 def make_height_map(terrain: Terrain, device: str) -> Callable[[Tensor], Tensor]:
-    """The lookup that is fastest on ``device``; both give the same heights."""
+    """The faster lookup on ``device``; both give the same heights."""
     if device == "cpu":
         return HeightMap(terrain, device)
     from legged_mw.sim.ground_contact import HeightLookup  # here, because importing warp takes a second

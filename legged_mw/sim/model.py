@@ -1,12 +1,10 @@
-"""From a robot's file to a compiled model, with ground, motors and sensors. Host only; nothing is stepped.
+"""Compile a robot's file into a model with ground, motors and sensors. Host only; nothing is stepped.
 
-The file states facts of the machine (mass, geometry, joint range, armature, friction, force limit). The caller's
-numbers state choices (gains, ground, what collides, what is sensed). Every name in a choice must match something in the
-file. ``RobotModel.overrides`` lists what a choice changes.
+The file states facts of the machine (mass, geometry, joint range, armature, friction, force limit). The caller chooses
+gains, ground, colliders and sensors; every name in a choice must exist in the file. ``RobotModel.overrides`` lists all
+that a choice changes.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
@@ -20,17 +18,16 @@ import numpy as np
 from legged_mw.sim.fixed_bodies import fuse_fixed, sensed_site
 from legged_mw.sim.geom_names import GeomNames, name_geoms
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
-from legged_mw.sim.joints import PosedRobot, pose_joints, posed, set_machine
+from legged_mw.sim.joints import pose_joints, posed
 from legged_mw.sim.robot_file import Keyframe, RobotFile, naming, read_plain
 from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
-from legged_mw.sim.servos import Drive
+from legged_mw.sim.servos import Drive, set_machine
 from legged_mw.sim.surface_points import add_sites, surfaces
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError, unknown
 
-# option -> its values
-_CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}
-_FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
+_FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}  # options that are bits
+_ENUMS = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver, **_FLAGS}
 _INTEGRATORS = {"euler": mujoco.mjtIntegrator.mjINT_EULER, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
 
 
@@ -51,23 +48,22 @@ class RobotModel:
     physics: mujoco.MjModel  # what is stepped: no visual geoms
     root: str  # name of the body that carries the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
-    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer", and what more was asked for -> span of sensordata
-    spec: mujoco.MjSpec  # the same with visual geoms, without ``more_sensors``: to copy, never to change
+    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" and ``more_sensors`` -> span of sensordata
+    spec: mujoco.MjSpec  # the same with visual geoms, without ``more_sensors``: copy it, never change it
     names: GeomNames  # of geoms and bodies
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
-    site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each site that was asked for with geoms
+    site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each of ``sites``
     terrain: Terrain | None = None  # None: the plane
-    # what was dropped, added or changed, a line each; "warning: ..." needs the caller
-    overrides: list[str] = field(default_factory=list)
-    imu: str = ""  # site whose accelerometer is sensed, on the root and with its axes
-    pose: tuple[float, ...] = ()  # (D,) the caller's, or else the keyframe's [rad]
+    overrides: list[str] = field(
+        default_factory=list
+    )  # a line for each thing dropped, added or changed, or a "warning: "
+    imu: str = ""  # site of the accelerometer, on the root and with its axes
+    pose: tuple[float, ...] = ()  # (D,) the caller's, else the keyframe's [rad]
     held: tuple[str, ...] = ()  # joints of the file that are welded
-    # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
-    speed_limits: tuple[float, ...] = ()
-    tables: dict[str, list[float]] = field(default_factory=dict)  # (D,) each, of the tables that were given
+    speed_limits: tuple[float, ...] = ()  # (D,) [rad/s] of the motors, not in the physics; no limit is infinite
+    tables: dict[str, list[float]] = field(default_factory=dict)  # the caller's tables -> (D,) values
     keyframe: Keyframe | None = None  # the file's
-    # names of its sensors, of which ``more_sensors`` are kept, and those that feel contact
-    file_sensors: tuple[str, ...] = ()
+    file_sensors: tuple[str, ...] = ()  # the file's; kept are ``more_sensors`` and those that feel contact
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -82,20 +78,19 @@ class RobotModel:
         )
 
     def ground_geoms(self) -> slice:
-        """Indices of the geoms that are the ground: MuJoCo counts geoms body by body, and these are the world's."""
-        count = int(self.physics.body_geomnum[0])
-        names = [self.physics.geom(i).name for i in range(count)]
+        """Indices of the geoms that are the ground; all are geoms of the world body."""
+        names = [self.physics.geom(i).name for i in range(int(self.physics.body_geomnum[0]))]
         first = names.index(GROUND)
         return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
 
     def columns(self, sensor: str) -> slice:
-        """Columns of sensordata of the sensor called so."""
+        """Columns of sensordata that ``sensor`` fills."""
         index = self.id("sensor", sensor)
         start = int(self.physics.sensor_adr[index])
         return slice(start, start + int(self.physics.sensor_dim[index]))
 
     def id(self, kind: str, name: str) -> int:
-        """Index of the ``kind`` ("body", "geom", "site", "sensor") called ``name``."""
+        """Index of the body, geom, site or sensor (``kind``) called ``name``."""
         obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         index = mujoco.mj_name2id(self.physics, obj, name)
         if index < 0:
@@ -114,77 +109,49 @@ def build_model(
     damping: Mapping[str, float],  # as for per_joint: passive joint damping [N m s/rad]
     colliders: Sequence[str],  # geoms that touch the ground: names of geoms or bodies, or patterns with * and ?
     self_collisions: bool,
-    contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; likewise, each geom once
+    contact_geoms: Sequence[str],  # likewise: each senses its contacts with the ground
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
-    imu_site: str
-    | None,  # sensed: acceleration in the root's axes [m/s^2]; see fixed_bodies.sensed_site; None: not at all
-    sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, likewise, for a site that the file lacks
+    imu_site: str | None,  # sensed: acceleration in the root's axes [m/s^2]; see sensed_site; None: nothing
+    sites: Mapping[str, Sequence[str]] = {},  # name -> geoms, likewise, for a site that the file lacks
     pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad], before the keyframe's; None: those, or 0
-    tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
+    tables: Mapping[str, Mapping[str, float]] = {},  # name -> table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
-    partial: Mapping[str, Mapping[str, float]]
-    | None = None,  # tables of PARTIAL, as for some_joints: they win over the file
-    more_sensors: Collection[str] = (),  # what else is sensed: names of sensors.py, or of the file's own sensors
-    drive: Drive = "angle",  # what `ctrl` means; with servos.CURVE in `tables` motors have torque-speed curves
+    partial: Mapping[str, Mapping[str, float]] = {},  # tables of PARTIAL, as for some_joints: they win over the file
+    more_sensors: Collection[str] = (),  # more that is sensed: names of SENSORS, or of the file's own sensors
+    drive: Drive = "angle",  # what ``ctrl`` means; with servos.CURVE in ``tables`` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
     robot = read_file(file, more_sensors)
-    spec, notes = robot.spec, robot.notes
+    spec, notes, root = robot.spec, robot.notes, robot.root
     with naming(file):
         posed = pose_joints(robot, {"stiffness": stiffness, "damping": damping, **tables}, pose, held_joints)
         names = name_geoms(spec, robot.where, notes)
-        imu = "" if imu_site is None else sensed_site(spec, posed.model, robot.root, imu_site, robot.where, notes)
+        imu = "" if imu_site is None else sensed_site(robot, posed.model, imu_site)
         fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
         add_ground(spec, ground, notes)
         _set_collisions(spec, names.find(colliders, "colliders", colliding=True), self_collisions, notes)
         if self_collisions:
-            _leave_out_neighbours(spec, posed.joints, posed.angles, notes)
-        speeds = set_machine(robot, partial or {}, posed, drive)
-        made = {name: names.find(geoms, "sites") for name, geoms in (sites or {}).items()}
-        add_sites(spec, made, posed.angles, robot.where, notes)
+            _leave_out_neighbours(spec, posed.angles, notes)
+        speeds = set_machine(robot, partial, posed, drive)
+        site_geoms = {name: names.find(geoms, "sites") for name, geoms in sites.items()}
+        add_sites(spec, site_geoms, posed.angles, robot.where, notes)
         touching = names.find(contact_geoms, "contact_geoms")
-        return _compile(robot, posed, names, ground, made, touching, velocity_sites, imu, speeds, more_sensors)
-
-
-def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
-    """The robot in ``file``; its own sensors called as ``wanted`` are kept. Raises ModelError for what is no robot."""
-    robot = read_plain(file)
-    if robot is None:
-        from legged_mw.robot.vendor import read_robot  # this file is not plain
-
-        robot = read_robot(file, wanted)
-    return robot
-
-
-def _compile(
-    robot: RobotFile,
-    posed: PosedRobot,
-    names: GeomNames,
-    ground: Ground,
-    site_geoms: dict[str, tuple[str, ...]],
-    touching: tuple[str, ...],
-    velocity_sites: Sequence[str],
-    imu: str,
-    speeds: tuple[float, ...],
-    more_sensors: Collection[str],
-) -> RobotModel:
-    """Add the sensors, and compile what is stepped."""
-    add_sensors(robot.spec, touching, velocity_sites, imu, robot.where)
-    whole = robot.spec.copy()
-    add_more_sensors(robot.spec, robot.root, touching, more_sensors)
-    physics = _compile_bare(robot.spec, ground, robot.notes)
+        add_sensors(spec, touching, velocity_sites, imu, robot.where)
+        whole = spec.copy()
+        add_more_sensors(spec, root, touching, more_sensors)
+        physics = _compile_bare(spec, ground, notes)
     return RobotModel(
         physics=physics,
-        root=robot.root,
+        root=root,
         joint_names=tuple(posed.joints),
-        sensors=sensor_spans(physics, touching, velocity_sites, imu, more_sensors),
+        sensors=sensor_spans(physics, more_sensors),
         spec=whole,
         names=names,
         contact_geoms=touching,
         site_geoms=site_geoms,
         terrain=ground.terrain,
-        overrides=robot.notes,
+        overrides=notes,
         imu=imu,
         pose=tuple(posed.angles),
         held=tuple(posed.held),
@@ -195,8 +162,18 @@ def _compile(
     )
 
 
+def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
+    """Read the robot in ``file``, and keep its ``wanted`` sensors. Raises ModelError if it is no robot."""
+    robot = read_plain(file)
+    if robot is None:
+        from legged_mw.robot.vendor import read_robot  # this file is not plain
+
+        return read_robot(file, wanted)
+    return robot
+
+
 def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujoco.MjModel:
-    """Compile what is stepped: without visual geoms, lights and cameras."""
+    """Compile the physics, without visual geoms, lights and cameras."""
     spec.compiler.discardvisual = True
     for extra in [*spec.lights, *spec.cameras]:  # mujoco-warp would move lights in every step
         spec.delete(extra)
@@ -215,10 +192,10 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
         "solver": mujoco.mjtSolver.mjSOL_NEWTON,
         "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
         "integrator": _INTEGRATORS[solver.integrator],
-        "impratio": 1.0,  # what is more is for the elliptic cone
+        "impratio": 1.0,  # other values are for the elliptic cone
         "noslip_iterations": 0,  # mujoco-warp has no such solver
         "enableflags": 0,
-        # Euler's damping stays explicit, as it was trained with; implicitfast does not read this flag
+        # Euler damps joints explicitly; implicitfast ignores this flag
         "disableflags": spec.option.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value,
     }
     for name, value in wanted.items():
@@ -230,20 +207,15 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
 
 def _option(name: str, value: float) -> str:
     """A value of an option in the words of MJCF."""
-    if name in _CHOICES:
-        return _CHOICES[name](value).name.split("_")[1].lower()
-    if name in _FLAGS:
-        flags = [
-            text.split("_")[1].lower()
-            for text, flag in _FLAGS[name].__members__.items()
-            if "_" in text and int(value) & flag.value
-        ]
-        return " ".join(flags) or "none"
-    return f"{value:g}"
+    if name not in _ENUMS:
+        return f"{value:g}"
+    members = [(word, member.value) for word, member in _ENUMS[name].__members__.items() if "_" in word]
+    fits = [word for word, bit in members if (int(value) & bit if name in _FLAGS else int(value) == bit)]
+    return " ".join(word.split("_")[1].lower() for word in fits) or "none"
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, notes: list[str]) -> None:
-    """The ground is contype 1 and colliders have conaffinity 1; with self-collisions both have bit 2 too."""
+    """The ground is contype 1 and colliders have conaffinity 1; with self-collisions colliders have bit 2 in both."""
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
     off = []
     for geom in robot:
@@ -259,10 +231,8 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
         notes.append(f"collisions off: {', '.join(off)}")
 
 
-def _leave_out_neighbours(
-    spec: mujoco.MjSpec, joints: Sequence[str], angles: Sequence[float], notes: list[str]
-) -> None:
-    """Exclude pairs of bodies that overlap with ``joints`` at ``angles`` [rad]: they would always push against each other.
+def _leave_out_neighbours(spec: mujoco.MjSpec, angles: Sequence[float], notes: list[str]) -> None:
+    """Exclude pairs of bodies that overlap with the joints at ``angles`` (D,) [rad]: they would always push each other.
 
     MuJoCo itself leaves out bodies that a joint joins.
     """
@@ -271,10 +241,7 @@ def _leave_out_neighbours(
     copy = spec.copy()
     copy.delete(copy.geom(GROUND))
     model = copy.compile()
-    data = mujoco.MjData(model)
-    for name, angle in zip(joints, angles, strict=True):
-        data.qpos[model.joint(name).qposadr[0]] = angle
-    mujoco.mj_kinematics(model, data)
+    data = posed(model, angles)
     mujoco.mj_comPos(model, data)
     mujoco.mj_collision(model, data)
     touching = {tuple(sorted(int(model.geom_bodyid[geom]) for geom in contact.geom)) for contact in data.contact}
@@ -291,7 +258,7 @@ def _leave_out_neighbours(
 
 
 class Upright(NamedTuple):
-    """S sites of a robot whose root is upright at the world's origin, and their bodies."""
+    """S sites of a robot with an upright root, and their bodies."""
 
     places: np.ndarray  # (S, 3) of the sites in the root's frame [m]
     bodies: np.ndarray  # (S,) index of each site's body
@@ -299,7 +266,7 @@ class Upright(NamedTuple):
 
 
 def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) -> Upright:
-    """The robot stands upright with its joints at ``joints`` (D,) [rad]: where ``sites`` are then."""
+    """Places of ``sites`` when the root is upright and the joints are at ``joints`` (D,) [rad]."""
     model, data = robot.physics, posed(robot.physics, joints)
     where = [robot.id("site", name) for name in sites]
     bodies = model.site_bodyid[where]

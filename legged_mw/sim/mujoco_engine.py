@@ -1,10 +1,8 @@
 """MuJoCo's own engine, on a thread pool of the CPU, behind fixed torch tensors.
 
-It computes in float64 on rows of its own; the tensors are float32. The two meet in ``step`` and nowhere else.
+The engine has float64 rows, the tensors are float32. Only ``step`` copies between them.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import copy
@@ -22,7 +20,7 @@ from legged_mw.utils.errors import ModelError, unknown
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.opaque import not_traced
 
-_STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step reads and writes the state, and reads the rest
+_STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step writes the state; it reads both
 _READ = ("sensordata", "actuator_force", "site_xpos", "xquat")  # computed by a step
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
@@ -41,24 +39,24 @@ class MujocoSimulation(Simulation):
         """Allocate ``num_envs`` worlds, stepped by ``threads`` threads; 0: one a core."""
         self.num_envs = num_envs
         model = copy.copy(model)
-        # else it resets a broken world by itself, unasked
+        # else MuJoCo resets a broken world by itself
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _keep_quiet()
         self._batch = Batch(model, num_envs, threads or usable_cores())
-        self._start = self._batch.state[0].copy()  # a row of state, as the model has it
-        pairs = {name: self._adopt(name) for name in (*_STATE, *_WRITTEN, *_READ)}  # tensors and the engine's rows
-        self._into = [pairs[name] for name in (*_STATE, *_WRITTEN)]  # to be copied before a step
-        self._out = [pairs[name] for name in (*_STATE, *_READ)]  # and after it
+        self._start = self._batch.state[0].copy()  # the model's initial state
+        pairs = {name: self._adopt(name) for name in (*_STATE, *_WRITTEN, *_READ)}  # (tensor, the engine's rows)
+        self._into = [pairs[name] for name in (*_STATE, *_WRITTEN)]  # copied before a step
+        self._out = [pairs[name] for name in (*_STATE, *_READ)]  # copied after a step
         self._cleared = [tensor for name, (tensor, _) in pairs.items() if name != "qpos"]
         self._field_rows = {name: self._expand(name) for name in world_fields}
         self._fields = {name: rows.float() for name, rows in self._field_rows.items()}
         self._written = {name: tensor._version for name, tensor in self._fields.items()}
-        self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
+        self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo could not step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
 
     @not_traced
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
-        if before is not None:  # between substeps the state is float32, as for who reads it
+        if before is not None:  # the state is float32 between substeps, too
             for i in range(substeps):
                 before(i)
                 self.step()
@@ -69,7 +67,7 @@ class MujocoSimulation(Simulation):
         refused = None
         try:
             self._batch.step(nstep=substeps)
-        except SimulationError as error:  # the other worlds are stepped all the same
+        except SimulationError as error:  # the other worlds are stepped
             refused, self._failed[error.ids], self._reason = error.ids, True, " ".join(str(error).split())
         for tensor, rows in self._out:
             tensor.copy_(rows)
@@ -81,7 +79,7 @@ class MujocoSimulation(Simulation):
         which = mask.numpy()
         if not which.any():
             return
-        self._batch.state[which] = self._start  # the solver's first guess and the clock too
+        self._batch.state[which] = self._start  # also the solver's warm start and the clock
         worlds = mask.nonzero()[:, 0]
         self.qpos[worlds] = self._qpos0
         for tensor in self._cleared:
@@ -107,18 +105,19 @@ class MujocoSimulation(Simulation):
         if self._failed.any():
             return f"MuJoCo could not step {self._failed.sum()} {of}: {self._reason}"
         if (full := self._full()).any():
-            return f"simulator overflow in {full.sum()} {of}: contacts or constraints do not fit; raise <size memory=...> in the MJCF"
+            advice = "contacts or constraints do not fit; raise <size memory=...> in the MJCF"
+            return f"simulator overflow in {full.sum()} {of}: {advice}"
         return ""
 
     def _write_fields(self) -> None:
-        """Hand over the fields that were written since the last time; the others keep their float64 values."""
+        """Copy the fields that were written since the last call; the others keep their float64 values."""
         for name, tensor in self._fields.items():
             if tensor._version != self._written[name]:
                 self._field_rows[name].copy_(tensor)
                 self._written[name] = tensor._version
 
     def _full(self) -> np.ndarray:
-        """Worlds that ever had to leave a contact or a constraint out: MuJoCo counts since construction."""
+        """Worlds that dropped a contact or constraint since construction."""
         return (self._batch.warning[:, _FULL, 1] > 0).any(axis=1)
 
     def _adopt(self, name: str) -> tuple[Tensor, Tensor]:
@@ -130,25 +129,22 @@ class MujocoSimulation(Simulation):
 
     def _expand(self, name: str) -> Tensor:
         """The engine's rows (N, ...) of a field of the model."""
-        known = sorted(
-            field
-            for field in MODEL_FIELDS
-            if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64
-        )
+        arrays = {field: getattr(self._batch.model, field, None) for field in sorted(MODEL_FIELDS)}
+        known = [field for field, array in arrays.items() if getattr(array, "dtype", None) == np.float64]
         if name not in (*known, GRAVITY):
             raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
         return _tensor(self._batch.expand(name))
 
 
 def _keep_quiet() -> None:
-    """A world that breaks is the task's to count and to reset; MuJoCo would print a line and write a file of its own."""
+    """Keep MuJoCo from printing and logging to a file when a world breaks: the caller counts and resets such worlds."""
     config = mujoco.MjLogConfig.get()
     config.logto_console = config.logto_file = False
     config.set()
 
 
 def _tensor(rows: np.ndarray) -> Tensor:
-    """The same memory as a tensor."""
+    """A tensor on the same memory."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # outputs of the engine are read-only, which torch cannot know
+        warnings.simplefilter("ignore")  # some rows are read-only, which torch warns of
         return torch.from_numpy(rows)

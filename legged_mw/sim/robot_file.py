@@ -1,10 +1,5 @@
-"""Read a robot's file: here a plain MJCF, as those in ``resources/robots`` are; ``legged_mw.robot`` reads all others.
+"""Read a plain MJCF, such as those in ``resources/robots``; ``legged_mw.robot`` reads all other files of robots."""
 
-Host only; nothing is stepped.
-"""
-
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import re
@@ -18,22 +13,22 @@ from xml.etree.ElementTree import XML, Element, ParseError, tostring
 import mujoco
 import numpy as np
 
-from legged_mw.sim.servos import Range, take_limits
 from legged_mw.utils.errors import ModelError
 
 # What a plain MJCF consists of: one body with a free joint, no other file, numbers that a machine may have.
 _SECTIONS = {"compiler", "option", "default", "asset", "worldbody", "keyframe"}
 _IN_ASSET = {"material", "mesh"}
 _IN_COMPILER = {"angle", "autolimits"}
-_IN_DEFAULT = {"default", "joint"}  # of its main class, which is that of what we add, too
+_IN_DEFAULT = {"default", "joint"}  # other defaults would apply to elements that are added
 _IN_BODY = {"body", "freejoint", "joint", "inertial", "geom", "site"}
 _NOT_NEGATIVE = {"mass", "density", "diaginertia", "armature", "frictionloss"}
 _MOST_BYTES, _LARGEST = 1 << 20, 1e5  # of a plain file; of its numbers, in any unit, and of the mass [kg]
-# names of what is added around a robot: by sim.ground, and to be looked at
+# names of the ground and of a scene, which are added around a robot
 SCENE = re.compile(r"(floor|ground|around|relief|sky)(/.*)?")
 
+Range = tuple[float, float]
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-UPRIGHT = 0.5  # [degrees] of tilt that are rounding
+UPRIGHT = 0.5  # [degrees] less tilt is rounding
 
 
 @dataclass(frozen=True)
@@ -47,16 +42,16 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class RobotFile:
-    """A robot alone: one root with a free joint, named joints, no actuators, of its own sensors those that feel contact or are wanted."""
+    """A robot alone: one root with a free joint, named joints, no actuators, few of its own sensors."""
 
     spec: mujoco.MjSpec
     model: mujoco.MjModel  # the same, compiled
     where: str  # the file's name
-    notes: list[str]  # what was dropped, added or renamed, a line each
-    limits: dict[str, Range]  # joint -> force [N m], of those that the file limits
+    notes: list[str]  # a line for each thing that was dropped, added or renamed
+    limits: dict[str, Range]  # joint -> lowest and highest force [N m], where the file limits it
     speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
     keyframe: Keyframe | None  # "home", or the only one
-    sensors: tuple[str, ...] = ()  # names of the file's, kept or dropped
+    sensors: tuple[str, ...] = ()  # names of the file's sensors, kept or dropped
 
     @property
     def root(self) -> str:
@@ -70,7 +65,7 @@ class RobotFile:
 
 
 def read_plain(file: Path) -> RobotFile | None:
-    """Read a plain MJCF. None: it is not plain, or wrong; ``legged_mw.robot.vendor`` reads it, or says what is wrong."""
+    """Read a plain MJCF. None if ``file`` is not plain: ``legged_mw.robot.vendor`` reads it or says why not."""
     try:
         if not file.is_file() or file.stat().st_size > _MOST_BYTES:
             return None
@@ -78,10 +73,10 @@ def read_plain(file: Path) -> RobotFile | None:
         if "<!DOCTYPE" in text or not _is_plain(root := XML(text)):
             return None
         spec = mujoco.MjSpec.from_string(tostring(root, encoding="unicode"))
-        limits, joints = take_limits(spec, notes), list(spec.joints)[1:]
+        limits, joints = joint_limits(spec), list(spec.joints)[1:]
         if not joints or not all(joint.type in SCALAR_JOINTS and joint.name for joint in joints):
             return None
-        for key in list(spec.keys):  # which would have to fit the motors that are added
+        for key in list(spec.keys):  # its size would not fit the motors that are added
             qpos, names = list(key.qpos), [joint.name for joint in joints]
             if len(qpos) != 7 + len(names) or tilt(qpos[3:7]) > UPRIGHT:
                 return None
@@ -99,7 +94,7 @@ def read_plain(file: Path) -> RobotFile | None:
 
 
 def _is_plain(root: Element) -> bool:
-    """By its elements and attributes alone, before MuJoCo reads it."""
+    """Decided by elements and attributes alone, before MuJoCo reads the file."""
     bodies = root.findall("worldbody/*")
     if root.tag != "mujoco" or len(bodies) != 1 or not bodies[0].get("name"):
         return False
@@ -134,8 +129,22 @@ def _tags(element: Element) -> set[str]:
     return {child.tag for child in element}
 
 
+def joint_limits(spec: mujoco.MjSpec) -> dict[str, Range]:
+    """Joint -> lowest and highest force [N m], of joints with an actuatorfrcrange (in a URDF: effort)."""
+    return {
+        joint.name: tuple(joint.actfrcrange)
+        for joint in spec.joints
+        if is_limited(joint.actfrclimited, joint.actfrcrange)
+    }
+
+
+def is_limited(switch: int, span: np.ndarray) -> bool:
+    """Whether a limit with this switch and range is in force."""
+    return bool(switch != mujoco.mjtLimited.mjLIMITED_FALSE and span[1] > span[0])
+
+
 def compile_copy(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile ``spec``, looks only where they come from files: they take most of the time, and only files can be wrong."""
+    """Compile a copy of ``spec``. Visual geoms are slow: compile them only to find mistakes in files of theirs."""
     copy = spec.copy()
     copy.compiler.discardvisual = not any(item.file for item in (*spec.meshes, *spec.textures))
     return copy.compile()
@@ -143,26 +152,24 @@ def compile_copy(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 @contextmanager
 def naming(file: Path) -> Iterator[None]:
-    """MuJoCo's errors in one line, with the file's name."""
+    """Turn MuJoCo's errors into one line with the file's name."""
     try:
         yield
     except ModelError:
         raise
-    except (ValueError, RecursionError) as error:  # parsing does not see a name that is used twice, compiling does
-        why = (
-            "it is nested too deeply"
-            if isinstance(error, RecursionError)
-            else str(error).partition("The visual elements of the spec")[0]
-        )
+    except RecursionError:
+        raise ModelError(f"{file.name} is not a valid {kind_of(file)}: it is nested too deeply") from None
+    except ValueError as error:
+        why = str(error).partition("The visual elements of the spec")[0]
         raise ModelError(f"{file.name} is not a valid {kind_of(file)}: {' '.join(why.split())}") from None
 
 
 def kind_of(file: Path) -> str:
-    """What its name says that it is."""
+    """The format that its name states."""
     return "URDF" if file.suffix == ".urdf" else "MJCF"
 
 
 def tilt(quat: Sequence[float] | np.ndarray) -> float:
-    """Between the root's z axis and the vertical [degrees]; ``quat`` wxyz."""
+    """Angle between the root's z axis and the vertical [degrees]; ``quat`` wxyz."""
     w, x, y, z = np.array(quat) / (np.linalg.norm(quat) or 1.0)
     return float(np.degrees(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))))

@@ -1,7 +1,5 @@
-"""What is sensed on a robot: the sensors that are added to its file, and where their values lie in ``sensordata``."""
+"""The sensors that are added to a robot, and the columns of ``sensordata`` that they fill."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
@@ -14,28 +12,29 @@ from legged_mw.utils.errors import ModelError, unknown
 SELF_CONTACT = "self_contacts"  # how many contacts the robot has with itself
 ANGULAR_MOMENTUM = "angular_momentum"  # of the whole robot about its centre of mass, world frame [kg m^2/s]
 CONTACT_FORCE = "contact_forces"  # of each contact geom: the net force on the ground, world frame [N]
+_SENS, _OBJ = mujoco.mjtSensor, mujoco.mjtObj
 _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}")) for name in ("FOUND", "FORCE"))
 _NET = 3  # the contact sensor's reduction: all contacts as one, in the world's frame
 
 
 def _sense_self_contacts(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    tree = mujoco.mjtObj.mjOBJ_XBODY
+    tree = _OBJ.mjOBJ_XBODY
     itself = {"objtype": tree, "objname": root, "reftype": tree, "refname": root, "intprm": [_FOUND, 0, 1]}
-    spec.add_sensor(name=SELF_CONTACT, type=mujoco.mjtSensor.mjSENS_CONTACT, **itself)
+    spec.add_sensor(name=SELF_CONTACT, type=_SENS.mjSENS_CONTACT, **itself)
 
 
 def _sense_angular_momentum(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    momentum, body = mujoco.mjtSensor.mjSENS_SUBTREEANGMOM, mujoco.mjtObj.mjOBJ_BODY
-    spec.add_sensor(name=ANGULAR_MOMENTUM, type=momentum, objtype=body, objname=root)
+    body = {"objtype": _OBJ.mjOBJ_BODY, "objname": root}
+    spec.add_sensor(name=ANGULAR_MOMENTUM, type=_SENS.mjSENS_SUBTREEANGMOM, **body)
 
 
 def _sense_contact_forces(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    """The sensors of "contact" sense the force too, so that contacts are searched once."""
+    """The sensors of "contact" measure the force too, so that contacts are searched once."""
     for name in contact_geoms:
         spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]
 
 
-# What is sensed only where it is asked for: name -> what adds a sensor of that name, given the root and the contact geoms.
+# Sensors on demand: name -> function that adds the sensor of that name, given the root and the contact geoms.
 SENSORS: dict[str, Callable[[mujoco.MjSpec, str, Sequence[str]], None]] = {
     SELF_CONTACT: _sense_self_contacts,
     ANGULAR_MOMENTUM: _sense_angular_momentum,
@@ -46,60 +45,38 @@ SENSORS: dict[str, Callable[[mujoco.MjSpec, str, Sequence[str]], None]] = {
 def add_sensors(
     spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str, where: str
 ) -> None:
-    """In an order that makes each group one span of sensordata."""
-    sites = [s.name for s in spec.sites if s.name]
-    for name in contact_geoms:
-        spec.add_sensor(
-            name=f"contact/{name}",
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_GEOM,
-            objname=name,
-            reftype=mujoco.mjtObj.mjOBJ_GEOM,
-            refname=GROUND,
-            intprm=[_FOUND, 0, 1],  # data, no reduction, one slot
-        )
-    for name in [*velocity_sites, *([imu] if imu else [])]:
+    """Add contact sensors of geoms, velocities of sites and the accelerometer, each group in one span of sensordata."""
+    sites = [site.name for site in spec.sites if site.name]
+    for name in (*velocity_sites, *([imu] if imu else [])):
         if name not in sites:
             raise ModelError(unknown("site", name, sites, where))
-    site = mujoco.mjtObj.mjOBJ_SITE
+    geom, site = _OBJ.mjOBJ_GEOM, _OBJ.mjOBJ_SITE
+    with_ground = {"type": _SENS.mjSENS_CONTACT, "reftype": geom, "refname": GROUND}
+    for name in contact_geoms:
+        found = [_FOUND, 0, 1]  # data, no reduction, one slot
+        spec.add_sensor(name=f"contact/{name}", objtype=geom, objname=name, intprm=found, **with_ground)
     for name in velocity_sites:
-        spec.add_sensor(name=f"linvel/{name}", type=mujoco.mjtSensor.mjSENS_FRAMELINVEL, objtype=site, objname=name)
+        spec.add_sensor(name=f"linvel/{name}", type=_SENS.mjSENS_FRAMELINVEL, objtype=site, objname=name)
     if imu:
-        spec.add_sensor(
-            name=f"accelerometer/{imu}", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=site, objname=imu
-        )
+        spec.add_sensor(name=f"accelerometer/{imu}", type=_SENS.mjSENS_ACCELEROMETER, objtype=site, objname=imu)
 
 
 def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str], more: Collection[str]) -> None:
-    """Those of ``SENSORS`` that ``more`` names, behind what ``add_sensors`` added. Both engines compute them once a step."""
+    """Add those of ``SENSORS`` that ``more`` names, after ``add_sensors``. Both engines compute them once a step."""
     for name, add in SENSORS.items():
         if name in more:
             add(spec, root, contact_geoms)
 
 
-def sensor_spans(
-    model: mujoco.MjModel,
-    contact_geoms: Sequence[str],
-    velocity_sites: Sequence[str],
-    imu: str,
-    more: Collection[str],
-) -> dict[str, slice]:
-    """Columns of sensordata, by group."""
-    spans = {
-        "contact": _columns(model, [f"contact/{name}" for name in contact_geoms]),
-        "linvel": _columns(model, [f"linvel/{name}" for name in velocity_sites]),
-        "accelerometer": _columns(model, [f"accelerometer/{imu}"] if imu else []),
-    }
-    spans |= {name: _columns(model, [name]) for name in SENSORS if name in more and name != CONTACT_FORCE}
+def sensor_spans(model: mujoco.MjModel, more: Collection[str]) -> dict[str, slice]:
+    """Columns of sensordata, by group: those of ``add_sensors``, and those of ``SENSORS`` that ``more`` names."""
+    groups = ["".join(model.sensor(i).name.partition("/")[:2]) for i in range(model.nsensor)]
+    spans = {}
+    for group in ("contact/", "linvel/", "accelerometer/", *(name for name in SENSORS if name in more)):
+        members = [i for i, of in enumerate(groups) if of == group]
+        starts, sizes = model.sensor_adr[members], model.sensor_dim[members]
+        spans[group.rstrip("/")] = slice(int(starts[0]), int(starts[0] + sizes.sum())) if members else slice(0, 0)
     if CONTACT_FORCE in more:
-        spans[CONTACT_FORCE] = spans["contact"]  # (contacts, 4), whose first column is the count
+        spans[CONTACT_FORCE] = spans["contact"]  # (contacts, 4), of which the first column is the count
         spans["contact"] = slice(spans["contact"].start, spans["contact"].stop, 4)
     return spans
-
-
-def _columns(model: mujoco.MjModel, sensors: Sequence[str]) -> slice:
-    """Those of ``sensors``, which lie one behind the other."""
-    if not sensors:
-        return slice(0, 0)
-    first, last = (model.sensor(name).id for name in (sensors[0], sensors[-1]))
-    return slice(int(model.sensor_adr[first]), int(model.sensor_adr[last] + model.sensor_dim[last]))

@@ -1,80 +1,116 @@
-"""A motor a joint in place of the file's actuators: its law and gains are the caller's, its force limits the machine's."""
+"""A motor a joint: the caller chooses its law and gains, the machine states force limit, armature and dry friction."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Literal
 
 import mujoco
 import numpy as np
 from torch import Tensor
 
+from legged_mw.sim.joints import PARTIAL, PosedRobot, some_joints
+from legged_mw.sim.robot_file import Range, RobotFile
 from legged_mw.utils.motor_network import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
 
-Range = tuple[float, float]
-# what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]
+# what ctrl means: an angle to turn to [rad], a speed [rad/s], or a torque [N m]
 Drive = Literal["angle", "speed", "torque"]
 # tables of motors with a torque-speed curve, before a "gear": [N m], [rad/s]
 CURVE = ("stall_torque", "no_load_speed")
-_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
-_NEVER, _ALWAYS = mujoco.mjtLimited.mjLIMITED_FALSE, mujoco.mjtLimited.mjLIMITED_TRUE
 
 
-def take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
-    """Joint -> lowest and highest force at the joint [N m]; the file's actuators are removed.
+def set_machine(
+    robot: RobotFile, partial: Mapping[str, Mapping[str, float]], posed: PosedRobot, drive: Drive
+) -> tuple[float, ...]:
+    """Add motors with force limits, armature and dry friction; ``partial`` (tables of PARTIAL) wins over the file.
 
-    Of what states one, in this order: the joint's actuatorfrcrange (a URDF's effort is read as that), the actuator's forcerange
-    through its gear, a motor's ctrlrange through gain and gear.
+    Torque-speed curves in ``posed.tables`` become the joints'. Returns speed limits (D,) [rad/s]; no limit is infinite.
     """
-    limits = {
-        j.name: (j.actfrcrange[0], j.actfrcrange[1]) for j in spec.joints if _limited(j.actfrclimited, j.actfrcrange)
+    tables, notes = posed.tables, robot.notes
+    tables.update(_curves_at_joints(tables))
+    given = {what: some_joints(partial.get(what, {}), posed.joints, what, posed.held) for what in PARTIAL}
+    for name, most in given["effort"].items():
+        if robot.limits.get(name) != (-most, most):
+            old = robot.limits[name][1] if name in robot.limits else math.inf
+            notes.append(f"{name} force limit: {old:g} -> {most:g} N m")
+        robot.limits[name] = (-most, most)
+    for what, unit in (("armature", "kg m^2"), ("frictionloss", "N m")):
+        for joint in robot.joints:
+            old = getattr(joint, what)
+            new = given[what].get(joint.name, old)
+            if old != new:
+                notes.append(f"{joint.name} {what}: {old:g} -> {new:g} {unit}")
+                setattr(joint, what, new)
+    for number, (joint, span) in enumerate(zip(robot.joints, posed.ranges, strict=True)):
+        _add_motor(robot, joint, span, {name: values[number] for name, values in tables.items()}, drive)
+    curves = dict(zip(posed.joints, tables.get("no_load_speed", ()), strict=False))
+    if endless := [name for name in posed.joints if name not in robot.limits and not curves.get(name)]:
+        text = f"warning: nothing limits the force of {', '.join(endless)}"
+        notes.append(f"{text}: these servos are stronger than any motor; set effort")
+    speeds = robot.speeds | curves | given["joint_speed_limits"]
+    return tuple(speeds.get(name, np.inf) for name in posed.joints)
+
+
+def _curves_at_joints(tables: Mapping[str, list[float]]) -> dict[str, list[float]]:
+    """The torque-speed curves behind the gears: a gear multiplies a motor's torque and divides its speed."""
+    curves = {}
+    for name, power in zip(CURVE, (1.0, -1.0), strict=True):
+        if name in tables and "gear" in tables:
+            pairs = zip(tables[name], tables["gear"], strict=True)
+            curves[name] = [value * gear**power for value, gear in pairs]
+    return curves
+
+
+def _add_motor(
+    robot: RobotFile, joint: mujoco.MjsJoint, span: Range, numbers: Mapping[str, float], drive: Drive
+) -> None:
+    """Add MuJoCo's DC motor at 1 V if the joint has a curve, else its position servo or plain motor, with its limits.
+
+    A target angle is held to ``span``, the joint's range [rad]. A servo's damping is the joint's, outside of the force
+    limit; a DC motor's is part of its law, inside.
+    """
+    kp, kd, speed = numbers["stiffness"], numbers["damping"], numbers.get("no_load_speed", 0.0)
+    motor = robot.spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    if speed:
+        gains = (0.0, 0.0) if drive == "torque" else (kp, kd)
+        motor.set_to_dcmotor(
+            motorconst=[0.0, 0.0],
+            resistance=0.0,
+            nominal=[1.0, numbers["stall_torque"], speed],
+            controller=[gains[0], 0.0, gains[1], 0.0, 0.0, 1.0],
+            ctrlspec=_INPUTS[drive],
+        )
+    elif drive == "angle":
+        motor.set_to_position(kp)
+    else:
+        motor.set_to_motor()
+    passive = kd if drive == "angle" and not speed else 0.0
+    if joint.damping[0] != passive:
+        robot.notes.append(f"{joint.name} damping: {joint.damping[0]:g} -> {passive:g} N m s/rad")
+        joint.damping = [passive, *joint.damping[1:]]
+    damped = f"kd {kd:g} N m s/rad"
+    laws = {
+        "angle": f"kp {kp:g} N m/rad" + (f", {damped}" if passive != kd else ""),
+        "speed": damped,
+        "torque": "a torque",
     }
-    if actuators := list(spec.actuators):
-        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced")
-    for actuator in actuators:
-        if actuator.trntype in _JOINTS and actuator.target not in limits:
-            force = _force(actuator)
-            if force is not None:
-                limits[actuator.target] = (float(min(force)), float(max(force)))
-        spec.delete(actuator)
-    return limits
-
-
-def _limited(switch: int, span: np.ndarray) -> bool:
-    return bool(switch != _NEVER and span[1] > span[0])
-
-
-def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
-    """What the actuator can do at the joint [N m], both ways; None: anything, or what only a simulation tells."""
-    if _limited(actuator.forcelimited, actuator.forcerange):
-        return actuator.forcerange * actuator.gear[0]
-    is_motor = actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
-    if is_motor and _limited(actuator.ctrllimited, actuator.ctrlrange):
-        return actuator.ctrlrange * actuator.gear[0] * actuator.gainprm[0]
-    return None
-
-
-def curves_at_joints(tables: Mapping[str, list[float]]) -> dict[str, list[float]]:
-    """Those of CURVE that ``tables`` has, at the joint: a motor's torque grows by its gear, its speed shrinks."""
-    gears = tables.get("gear", [])
-    powers = {name: power for name, power in zip(CURVE, (1.0, -1.0), strict=True) if name in tables and gears}
-    return {
-        name: [value * gear**power for value, gear in zip(tables[name], gears, strict=True)]
-        for name, power in powers.items()
-    }
+    curve = f", {numbers['stall_torque']:g} N m at rest, none at {speed:g} rad/s" if speed else ""
+    robot.notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {laws[drive]}{curve}")
+    if drive == "angle" and np.isfinite(span).all():
+        motor.ctrllimited, motor.ctrlrange = True, span
+    if joint.name in robot.limits:  # on the motor and not on the joint, so that actuator_force is the clamped force
+        motor.forcelimited, motor.forcerange = True, list(robot.limits[joint.name])
+        joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
 
 
 def scaled_gains(
     nominal: Mapping[str, Tensor], factors: Mapping[str, Tensor], curves: bool
 ) -> Iterator[tuple[str, int, Tensor]]:
-    """Model field, place in it and its values (N, D): the gains of motors, ``nominal`` fields (1, D, ...) times ``factors`` (N, D).
+    """Model field, place in it and its values (N, D): ``nominal`` gains (1, D, ...) times ``factors`` (N, D).
 
-    Of MuJoCo's DC motor, which those with ``curves`` are, the no-load speed is 1 over its constant, the stall torque constant over
-    resistance.
+    With ``curves`` they are MuJoCo's DC motors: no-load speed = 1 / constant, stall torque = constant / resistance.
     """
     field = "actuator_gainprm"
     gains = nominal[field]
@@ -87,94 +123,3 @@ def scaled_gains(
     yield field, DC_RESISTANCE, gains[:, :, DC_RESISTANCE] / (speed * stall)
     yield field, DC_STIFFNESS, gains[:, :, DC_STIFFNESS] * factors.get("stiffness", 1.0)
     yield field, DC_DAMPING, gains[:, :, DC_DAMPING] * factors.get("damping", 1.0)
-
-
-class Motor(NamedTuple):
-    """What drives one joint; both speed and torques are the joint's, behind the gear."""
-
-    stiffness: float  # [N m/rad] of a motor that is driven by an angle; 0 of one that is driven by a speed
-    damping: float  # [N m s/rad] of a servo: in the joint; of a motor with a curve: in its law, under its limits
-    stall_torque: float = 0.0  # [N m] that it gives at rest
-    no_load_speed: float = 0.0  # [rad/s] at which it gives none; 0: it has no torque-speed curve
-
-    def add_to(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint, drive: Drive) -> mujoco.MjsActuator:
-        """The actuator: MuJoCo's DC motor at a supply of 1 V where there is a curve, else its position servo or its plain motor."""
-        motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        if self.no_load_speed:
-            gains = (0.0, 0.0) if drive == "torque" else (self.stiffness, self.damping)
-            motor.set_to_dcmotor(
-                motorconst=[0.0, 0.0],
-                resistance=0.0,
-                nominal=[1.0, self.stall_torque, self.no_load_speed],
-                controller=[gains[0], 0.0, gains[1], 0.0, 0.0, 1.0],
-                ctrlspec=_INPUTS[drive],
-            )
-        elif drive == "angle":
-            motor.set_to_position(self.stiffness)
-        else:
-            motor.set_to_motor()
-        return motor
-
-
-def add_motors(
-    spec: mujoco.MjSpec,
-    joints: Sequence[mujoco.MjsJoint],
-    angles: Sequence[Range],  # where each joint may be [rad]; infinite: anywhere
-    motors: Sequence[Motor],
-    drive: Drive,
-    limits: Mapping[str, Range],  # joint -> force [N m]
-    notes: list[str],
-) -> None:
-    """One motor a joint, held to its force limit, and to the joint's range if an angle drives it."""
-    for joint, (low, high), motor in zip(joints, angles, motors, strict=True):
-        kp, kd, stall, speed = motor
-        passive = kd if drive == "angle" and not speed else 0.0
-        old = float(np.atleast_1d(joint.damping)[0])
-        if old != passive:
-            notes.append(f"{joint.name} damping: {old:g} -> {passive:g} N m s/rad")
-        joint.damping = np.array([passive, *np.atleast_1d(joint.damping)[1:]]) if np.ndim(joint.damping) else passive
-        servo = motor.add_to(spec, joint, drive)
-        damped = f"kd {kd:g} N m s/rad"
-        laws = {
-            "angle": f"kp {kp:g} N m/rad" + (f", {damped}" if passive != kd else ""),
-            "speed": damped,
-            "torque": "a torque",
-        }
-        curve = f", {stall:g} N m at rest, none at {speed:g} rad/s" if speed else ""
-        notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {laws[drive]}{curve}")
-        if drive == "angle" and math.isfinite(low) and math.isfinite(high):
-            servo.ctrllimited, servo.ctrlrange = True, [low, high]
-        if joint.name in limits:  # on the motor and not on the joint, so that actuator_force is the clamped force
-            servo.forcelimited, servo.forcerange = True, list(limits[joint.name])
-            joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
-    endless = [
-        joint.name
-        for joint, motor in zip(joints, motors, strict=True)
-        if joint.name not in limits and not motor.no_load_speed
-    ]
-    if endless:
-        notes.append(
-            f"warning: nothing limits the force of {', '.join(endless)}: these servos are stronger than any motor; set effort"
-        )
-
-
-def set_joints(
-    joints: Sequence[mujoco.MjsJoint],
-    armature: Mapping[str, float],
-    frictionloss: Mapping[str, float],
-    notes: list[str],
-) -> None:
-    """What the caller knows better than the file: joint -> armature [kg m^2] and dry friction [N m]."""
-    for what, unit, values in (("armature", "kg m^2", armature), ("frictionloss", "N m", frictionloss)):
-        for joint in joints:
-            if joint.name in values and (old := getattr(joint, what)) != values[joint.name]:
-                notes.append(f"{joint.name} {what}: {old:g} -> {values[joint.name]:g} {unit}")
-                setattr(joint, what, values[joint.name])
-
-
-def set_efforts(limits: dict[str, Range], effort: Mapping[str, float], notes: list[str]) -> None:
-    """Likewise: joint -> highest force [N m], the same both ways."""
-    for name, most in effort.items():
-        if limits.get(name) != (-most, most):
-            notes.append(f"{name} force limit: {limits[name][1] if name in limits else math.inf:g} -> {most:g} N m")
-        limits[name] = (-most, most)

@@ -1,4 +1,4 @@
-"""What every physics engine promises: the seam, written once. Nothing above ``sim/`` knows which engine it talks to."""
+"""The interface of both physics engines. Nothing above ``sim/`` knows which engine runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged_mw.utils.errors import ModelError, unknown
 
-# If one of the first model fields has a value per world, the second ones, which MuJoCo derives from them, need one too.
+# MuJoCo derives the second fields from the first: if one of the first has a value per world, the second need one too.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 GRAVITY = "opt.gravity"  # (N, 3) [m/s^2], the one option that may differ between worlds
@@ -20,7 +20,7 @@ class Simulation(ABC):
 
     Every tensor below is fixed for the life of the object: read it, write it in place, never rebind it. After ``step``,
     ``qpos`` and ``qvel`` are current; the rest was computed at the start of the last substep, so it is one ``timestep``
-    old. After ``reset(mask)`` it is zero in the masked worlds. What is written is in force from the next ``step``.
+    old. After ``reset(mask)`` it is zero in the masked worlds. Writes take effect in the next ``step``.
     """
 
     engine: str  # "mujoco_warp" or "mujoco"
@@ -34,9 +34,7 @@ class Simulation(ABC):
     actuator_force: Tensor  # (N, nu) [N m], clamped, of the last substep
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
     xquat: Tensor  # (N, nbody, 4) attitude of each body, (w, x, y, z), body to world, of the last substep
-    xfrc_applied: (
-        Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
-    )
+    xfrc_applied: Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the centre of mass; persists
 
     _fields: dict[str, Tensor]  # of ``world_fields``
 
@@ -44,43 +42,42 @@ class Simulation(ABC):
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
         """Advance every world by ``substeps`` time steps, with the present ``ctrl`` and ``xfrc_applied``.
 
-        ``before(k)`` is called before substep k, with the state current, and may write ``ctrl``; on a GPU it must be recordable.
+        ``before(k)`` is called before substep k with the current state; it may write ``ctrl``. A GPU records it.
         """
 
     @abstractmethod
     def actuator_velocity(self) -> Tensor:
-        """(N, nu) speed [rad/s] at the moment of ``actuator_force``. Not for inside a recorded step.
+        """(N, nu) speed [rad/s] at the time of ``actuator_force``. Not for use in a recorded step.
 
-        Call it before the first step of interest: MuJoCo's own engine fills it from then on.
+        MuJoCo's own engine fills it only after the first call, so call it before the first step of interest.
         """
 
     @abstractmethod
     def reset(self, mask: Tensor) -> None:
-        """Reset the worlds where ``mask`` (N,) bool is true to ``qpos0`` at rest; all that is not state is zero until the next ``step``.
+        """Reset the worlds in ``mask`` (N,) to ``qpos0`` at rest. Derived quantities are zero until the next ``step``.
 
-        Write the wanted ``qpos``, ``qvel`` and ``ctrl`` after it.
+        Write ``qpos``, ``qvel`` and ``ctrl`` after it.
         """
 
     def field(self, name: str) -> Tensor:
         """View (N, ...) of a model field that was declared in ``world_fields``; write it in place."""
         if name not in self._fields:
-            raise ModelError(
-                unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)")
-            )
+            where = "this simulation (declare it in world_fields)"
+            raise ModelError(unknown("per-world model field", name, self._fields, where))
         return self._fields[name]
 
     @abstractmethod
     def memory(self) -> dict[str, Tensor]:
-        """All tensors that the next steps depend on, and what was sensed last, by name; model fields as ``model.<field>``.
+        """All tensors that later steps depend on and the last sensed values, by name; model fields: ``model.<field>``.
 
-        Copy them, or write them in place in worlds of the same model; then call ``set_constants`` if fields changed.
+        Copy them, or write them into worlds of the same model; then call ``set_constants`` if fields changed.
         """
 
     @abstractmethod
     def set_constants(self) -> None:
-        """Recompute in every world what the model derives from masses, inertias, armatures and zero angles.
+        """Recompute the constants that depend on masses, inertias, armatures and zero angles, in every world.
 
-        Slow, and not for inside a recorded step.
+        Slow, and not for use in a recorded step.
         """
 
     @abstractmethod
@@ -89,17 +86,17 @@ class Simulation(ABC):
 
     @abstractmethod
     def overflow_report(self) -> str:
-        """A line about what overflowed since construction, or ''. Reads the device: not for inside a step."""
+        """A line that names the overflows since construction, or ''. Reads the device: not for use in a step."""
 
 
 def overflow_note(sim: Simulation, what: str) -> str:
-    """A warning that ``what`` is not to be trusted, if contacts or constraints of ``sim`` did not fit; else ''. Reads the device."""
+    """A warning not to trust ``what`` if contacts or constraints of ``sim`` overflowed, else ''. Reads the device."""
     report = sim.overflow_report()
     return f"WARNING: {what} is not to be trusted: {report}" if report else ""
 
 
 def say_overflow(sim: Simulation, what: str) -> bool:
-    """Print that warning; returns whether there was one."""
+    """Print ``overflow_note``; returns whether there was one."""
     if note := overflow_note(sim, what):
         print(note, flush=True)
     return bool(note)

@@ -1,7 +1,5 @@
-"""Points or spheres on the surface of collision shapes: for contacts with a height field, and to find the lowest point."""
+"""Points and spheres on the surface of collision shapes, for contacts with a height field and for lowest points."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import itertools
@@ -12,29 +10,31 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.sim.joints import posed
 from legged_mw.utils.errors import ModelError
 
-SPACING = 0.01  # [m] between points when the lowest one is looked for
-LEVEL = 0.001  # [m] points so little above the lowest one are as low: a flat side has its site in the middle
+SPACING = 0.01  # [m] between points, to find the lowest one
+_LEVEL = 0.001  # [m] points less above the lowest one count as lowest, so a flat side gets its site in the middle
 Points = NDArray[np.float64]  # (P, 3) [m], in the geom's frame
 
 _KINDS = mujoco.mjtGeom
 
 
 def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points, float]:
-    """Centres of spheres that stand for the surface of ``geom``, at most about ``spacing`` [m] apart, and their radius [m].
+    """Centres of spheres on the surface of ``geom``, at most about ``spacing`` [m] apart, and their radius [m].
 
-    A sphere is itself, a capsule is a row of spheres, every other shape is points. Raises ModelError for shapes that are none of these.
+    A sphere is one sphere, a capsule a row of spheres, other shapes are points. Raises ModelError for unknown shapes.
     """
     kind, size = _KINDS(model.geom_type[geom]), model.geom_size[geom]
     if kind == _KINDS.mjGEOM_MESH:
         return _on_mesh(model, int(model.geom_dataid[geom]), spacing), 0.0
     if kind not in _POINTS:
         shape = str(kind).rsplit("_", 1)[-1].lower()
-        raise ModelError(
-            f"geom '{model.geom(geom).name}' is a {shape}: its surface is not known as points, as those of spheres, capsules, boxes, "
-            "cylinders, ellipsoids and meshes are. Give the MJCF one of those there, or take the engine mujoco"
+        known = "spheres, capsules, boxes, cylinders, ellipsoids and meshes"
+        text = (
+            f"geom '{model.geom(geom).name}' is a {shape}: its surface is not known as points, as those of {known} are"
         )
+        raise ModelError(f"{text}. Give the MJCF one of those there, or take the engine mujoco")
     radius = float(size[0]) if kind in (_KINDS.mjGEOM_SPHERE, _KINDS.mjGEOM_CAPSULE) else 0.0
     return np.array(_POINTS[kind](size, spacing), dtype=float).reshape(-1, 3), radius
 
@@ -46,14 +46,13 @@ def _on_box(size: Points, spacing: float) -> list[tuple[float, ...]]:
 
 def _on_cylinder(size: Points, spacing: float) -> list[tuple[float, ...]]:
     inner = np.linspace(0.0, size[0], math.ceil(size[0] / spacing) + 1)[:-1]
-    rings = [(size[0], z) for z in _spaced(size[1], spacing)] + [
-        (radius, z) for z in (-size[1], size[1]) for radius in inner
-    ]
+    rings = [(size[0], z) for z in _spaced(size[1], spacing)]
+    rings += [(radius, z) for z in (-size[1], size[1]) for radius in inner]
     return [(x, y, z) for radius, z in rings for x, y in _ring(radius, spacing)]
 
 
 def _on_ellipsoid(size: Points, spacing: float) -> list[tuple[float, ...]]:
-    """Rings around z, their places stretched along x and y."""
+    """Rings around z, stretched along x and y."""
     largest = float(size.max())
     angles = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 2 * max(3, math.ceil(0.5 * math.pi * largest / spacing)) + 1)
     rings = [(math.cos(angle) if abs(angle) < 1.57 else 0.0, math.sin(angle)) for angle in angles]
@@ -65,11 +64,11 @@ def _on_ellipsoid(size: Points, spacing: float) -> list[tuple[float, ...]]:
 
 
 def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
-    """The convex hull's outermost vertices in 26 directions, and the points where a grid of lines along each axis meets it."""
+    """The convex hull's outermost vertices in 26 directions, and its points on a grid of lines along each axis."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     vertices, faces = model.mesh_vert[first : first + count].astype(float), model.mesh_face[model.mesh_faceadr[mesh] :]
     faces = faces[: model.mesh_facenum[mesh]]
-    # the hull: how many vertices and faces, two lists a vertex, one an edge, then its faces
+    # the hull: numvert, numface, vert_edgeadr, vert_globalid, edge_localid (numvert + 3 numface), face_globalid
     if (start := model.mesh_graphadr[mesh]) >= 0:
         (count, number), graph = model.mesh_graph[start : start + 2], model.mesh_graph[start + 2 :]
         faces = graph[3 * count + 3 * number :][: 3 * number].reshape(-1, 3)
@@ -87,10 +86,10 @@ def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
 
 
 def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[int]) -> Points:
-    """Points (P, 3) of ``triangles`` (T, 3, 3) on ``lines`` (L, 2) along ``axis``, given by their places along the axes ``across``."""
+    """Points (P, 3) of ``triangles`` (T, 3, 3) on lines along ``axis``, at ``lines`` (L, 2) ``across`` it."""
     a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     (au, av), (bu, bv), (cu, cv) = a[:, across].T, ab[:, across].T, ac[:, across].T
-    # a triangle along the lines is met nowhere
+    # a triangle parallel to the lines has no area across them, and meets none
     area = np.where(np.abs(bu * cv - bv * cu) > 1e-12, bu * cv - bv * cu, np.inf)
     u, v = lines[:, :1] - au, lines[:, 1:] - av
     share_b, share_c = (u * cv - v * cu) / area, (v * bu - u * bv) / area
@@ -99,12 +98,12 @@ def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[
 
 
 def _spaced(half: float, spacing: float) -> list[float]:
-    """Places along an axis from one end to the other [m]."""
+    """Evenly spaced places from ``-half`` to ``half`` [m]."""
     return np.linspace(-half, half, max(2, math.ceil(2.0 * half / spacing) + 1)).tolist()
 
 
 def _ring(radius: float, spacing: float) -> list[tuple[float, float]]:
-    """Places around a circle [m]; of none, its middle."""
+    """Places around a circle [m]; its middle if the radius is 0."""
     count = max(12, 4 * math.ceil(0.5 * math.pi * radius / spacing)) if radius else 1
     return [(radius * math.cos(a), radius * math.sin(a)) for a in (2.0 * math.pi * i / count for i in range(count))]
 
@@ -118,47 +117,7 @@ _POINTS: dict[int, Callable[[Points, float], list[tuple[float, ...]]]] = {
 }
 
 
-# ---- sites that a file lacks: at a geom, or at the lowest point of several ----
-
-
-def add_sites(
-    spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: Sequence[float], where: str, notes: list[str]
-) -> None:
-    """Add each site (name -> geoms) that ``spec`` lacks.
-
-    A site of one geom is in its middle. A site of several is at the middle of their lowest points, with the joints at ``angles``
-    (D,) [rad], on the body of the lowest geom.
-    """
-    missing = {name: geoms for name, geoms in sites.items() if spec.site(name) is None}
-    if not missing:
-        return
-    copy = spec.copy()
-    copy.compiler.fusestatic = False
-    model = copy.compile()
-    data = mujoco.MjData(model)
-    data.qpos[3:] = [1.0, 0.0, 0.0, 0.0, *angles]
-    mujoco.mj_kinematics(model, data)
-    for name, geoms in missing.items():
-        if not geoms:
-            raise ModelError(f"site '{name}' is not in {where} and no geom is given for it")
-        if len(geoms) == 1:
-            geom, place = geoms[0], model.geom(geoms[0]).pos
-        else:
-            geom, place = _lowest(model, data, geoms)
-        # group 3: viewers do not draw it unless asked to
-        spec.geom(geom).parent.add_site(name=name, pos=place, group=3)
-        notes.append(f"site '{name}' made at {'the lowest point of ' if len(geoms) > 1 else ''}{', '.join(geoms)}")
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> tuple[str, np.ndarray]:
-    """The geom whose surface is lowest, and the middle of the lowest points on its body [m, body frame]."""
-    points = surfaces(model, data, geoms)
-    lowest = min(points, key=lambda name: round(points[name][:, 2].min(), 6))  # of equal ones the first
-    body = model.geom(lowest).bodyid[0]
-    there = np.concatenate([places for name, places in points.items() if model.geom(name).bodyid[0] == body])
-    low = there[there[:, 2] < there[:, 2].min() + LEVEL]
-    middle = 0.5 * (low.min(axis=0) + low.max(axis=0))
-    return lowest, (middle - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+# ---- lowest points, and sites that a file lacks
 
 
 def surfaces(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> dict[str, Points]:
@@ -169,3 +128,39 @@ def surfaces(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -
         places, radius = spheres_on(model, geom, SPACING)
         points[name] = data.geom_xpos[geom] + places @ data.geom_xmat[geom].reshape(3, 3).T - [0.0, 0.0, radius]
     return points
+
+
+def add_sites(
+    spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: Sequence[float], where: str, notes: list[str]
+) -> None:
+    """Add each site (name -> geoms) that ``spec`` lacks, with the joints at ``angles`` (D,) [rad].
+
+    A site of one geom is at its centre. A site of several is in the middle of their lowest points, on the lowest body.
+    """
+    missing = {name: geoms for name, geoms in sites.items() if spec.site(name) is None}
+    if not missing:
+        return
+    copy = spec.copy()
+    copy.compiler.fusestatic = False
+    model = copy.compile()
+    data = posed(model, angles)
+    for name, geoms in missing.items():
+        if not geoms:
+            raise ModelError(f"site '{name}' is not in {where} and no geom is given for it")
+        if len(geoms) == 1:
+            geom, place = geoms[0], model.geom(geoms[0]).pos
+        else:
+            geom, place = _lowest(model, data, geoms)
+        spec.geom(geom).parent.add_site(name=name, pos=place, group=3)  # viewers hide group 3
+        notes.append(f"site '{name}' made at {'the lowest point of ' if len(geoms) > 1 else ''}{', '.join(geoms)}")
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> tuple[str, np.ndarray]:
+    """The geom that reaches lowest, and the middle of the lowest points on its body [m, body frame]."""
+    points = surfaces(model, data, geoms)
+    lowest = min(points, key=lambda name: round(points[name][:, 2].min(), 6))  # the first, of equally low ones
+    body = model.geom(lowest).bodyid[0]
+    there = np.concatenate([places for name, places in points.items() if model.geom(name).bodyid[0] == body])
+    low = there[there[:, 2] < there[:, 2].min() + _LEVEL]
+    middle = 0.5 * (low.min(axis=0) + low.max(axis=0))
+    return lowest, (middle - data.xpos[body]) @ data.xmat[body].reshape(3, 3)

@@ -1,6 +1,6 @@
-"""Ground that is not flat: a grid of tiles, harder from row to row, another kind from column to column; one height field of all.
+"""Rough ground: one height field of tiles, with levels of difficulty along x and kinds of ground along y.
 
-Heights are made here, on the host, once.
+Heights are computed here once, on the host.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ PLATFORM = 1.0
 
 @dataclass(frozen=True)
 class Terrain:
-    """A height field of tiles, ``levels`` along x and ``len(kinds)`` along y, inside a flat border; x runs along levels, y along kinds.
+    """A height field of tiles, ``levels`` along x and ``len(kinds)`` along y, inside a flat border.
 
-    Between its vertices it is triangles, cut along the diagonal from (row, column) to (row + 1, column + 1), as MuJoCo's.
+    Each cell is two triangles, cut along the diagonal from (row, column) to (row + 1, column + 1), as in MuJoCo.
     """
 
     heights: Heights  # (R, C) [m], row = +y, column = +x, vertices at the rim included
@@ -44,19 +44,17 @@ class Terrain:
         return len(self.origins)
 
     def tile_at(self, x: float, y: float) -> tuple[int, int] | None:
-        """Level and column of the tile there [m, world]; None outside of all tiles."""
-        level, column = (
-            int(np.floor(along / self.tile + count / 2)) for along, count in ((x, self.levels), (y, len(self.kinds)))
-        )
+        """Level and column of the tile at x, y [m, world]; None outside of all tiles."""
+        level = int(np.floor(x / self.tile + self.levels / 2))
+        column = int(np.floor(y / self.tile + len(self.kinds) / 2))
         return (level, column) if 0 <= level < self.levels and 0 <= column < len(self.kinds) else None
 
     def vertices(self, level: int, column: int) -> tuple[slice, slice]:
-        """Rows and columns of ``heights`` that are a tile's, its rim included."""
+        """Rows and columns of ``heights`` in a tile, with its rim."""
         n = round(self.tile / self.cell)
         edge = (self.heights.shape[1] - 1 - self.levels * n) // 2
-        return slice(edge + column * n, edge + (column + 1) * n + 1), slice(
-            edge + level * n, edge + (level + 1) * n + 1
-        )
+        y, x = edge + column * n, edge + level * n
+        return slice(y, y + n + 1), slice(x, x + n + 1)
 
     def span(self) -> tuple[float, float]:
         """Lowest and highest point [m]."""
@@ -74,22 +72,24 @@ def make_terrain(
     border: float,
     seed: int,
 ) -> Terrain:
-    """Build all tiles; difficulty rises in equal steps from level to level. Raises ModelError for what does not exist or fit."""
+    """Build all tiles; difficulty rises evenly from level to level. Raises ModelError for arguments that do not fit."""
     for kind in proportions:
         if kind not in KINDS:
             raise ModelError.of(("proportions", unknown("kind of terrain", kind, KINDS, "the table of kinds")))
     n = round(tile / cell)
     if abs(n * cell - tile) > 1e-6 or tile < 4 * PLATFORM:
-        raise ModelError.of(
-            ("tile", f"{tile:g} m must be a whole number of cells of {cell:g} m, and at least {4 * PLATFORM:g} m")
-        )
+        must = f"must be a whole number of cells of {cell:g} m, and at least {4 * PLATFORM:g} m"
+        raise ModelError.of(("tile", f"{tile:g} m {must}"))
     kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
     edge = round(border / cell)
-    if (count := (columns * n + 2 * edge + 1) * (levels * n + 2 * edge + 1)) > MOST_HEIGHTS:
-        many = f"{levels} x {columns} tiles of {tile:g} m with a height every {cell:g} m have {count / 1e6:.0f} million heights"
+    shape = (columns * n + 2 * edge + 1, levels * n + 2 * edge + 1)
+    count = shape[0] * shape[1]
+    if count > MOST_HEIGHTS:
+        tiles = f"{levels} x {columns} tiles of {tile:g} m with a height every {cell:g} m"
         instead = f"take larger cells, fewer or smaller tiles, or less than {border:g} m around them"
-        raise ModelError.of(("cell", f"{many}, more than {MOST_HEIGHTS / 1e6:.0f}; {instead}"))
-    field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
+        many = f"have {count / 1e6:.0f} million heights, more than {MOST_HEIGHTS / 1e6:.0f}"
+        raise ModelError.of(("cell", f"{tiles} {many}; {instead}"))
+    field = np.zeros(shape)
     origins = np.zeros((levels, columns, 3))
     corner = (-0.5 * levels * tile - edge * cell, -0.5 * columns * tile - edge * cell)
     difficulties = tuple(_between(difficulty, level / max(levels - 1, 1)) for level in range(levels))
@@ -97,34 +97,30 @@ def make_terrain(
         for level, hard in enumerate(difficulties):
             grid = Grid(n, cell, pit=(column + level) % 2 == 0)
             patch = _checked(KINDS[kind](grid, hard, rng), kind, grid)
-            row0, col0 = edge + column * n, edge + level * n
+            row0, col0, half = edge + column * n, edge + level * n, n // 2
             field[row0 : row0 + n + 1, col0 : col0 + n + 1] = patch
-            middle = (col0 + n // 2, row0 + n // 2)
-            origins[level, column] = corner[0] + middle[0] * cell, corner[1] + middle[1] * cell, patch[n // 2, n // 2]
+            middle = (corner[0] + (col0 + half) * cell, corner[1] + (row0 + half) * cell)
+            origins[level, column] = *middle, patch[half, half]
     return Terrain(field, cell, corner, tile, kinds, difficulties, origins)
 
 
 def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
-    """The heights that the function ``kind`` made, if they are a tile's."""
-    patch, n = np.asarray(patch, dtype=float), grid.n
-    if patch.shape != (n + 1, n + 1):
-        raise ModelError(
-            f"kind of terrain '{kind}' returned heights of shape {patch.shape}; a tile has {(n + 1, n + 1)}, as grid.zeros()"
-        )
+    """The heights that the function of ``kind`` returned. Raises ModelError if they are no tile."""
+    patch, shape, name = np.asarray(patch, dtype=float), grid.zeros().shape, f"kind of terrain '{kind}'"
+    if patch.shape != shape:
+        raise ModelError(f"{name} returned heights of shape {patch.shape}; a tile has {shape}, as grid.zeros()")
     rim = np.concatenate([patch[[0, -1]].ravel(), patch[:, [0, -1]].ravel()])
     if not np.isfinite(patch).all() or np.abs(rim).max() > 1e-9:
-        raise ModelError(
-            f"kind of terrain '{kind}': its heights must be finite, and 0 along the rim so that tiles fit together (grid.fade does that)"
-        )
+        must = "its heights must be finite, and 0 along the rim so that tiles fit together"
+        raise ModelError(f"{name}: {must} (grid.fade does that)")
     if np.ptp(patch[grid.distance < PLATFORM - 0.5 * grid.cell]) > 1e-3:
-        raise ModelError(
-            f"kind of terrain '{kind}': it must be level within {PLATFORM:g} m of its middle, where robots begin (grid.fade does that)"
-        )
+        must = f"it must be level within {PLATFORM:g} m of its middle, where robots begin"
+        raise ModelError(f"{name}: {must} (grid.fade does that)")
     return patch
 
 
 def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, ...]:
-    """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
+    """A kind for each column, in the order given: shares rounded to whole columns, each kind at least once."""
     wanted = {kind: share for kind, share in proportions.items() if share > 0}
     if not wanted:
         none = f"no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}"
@@ -133,9 +129,8 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
         few = f"{columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one"
         raise ModelError.of(("columns", few))
     bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
-    kinds = [
-        list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)
-    ]
+    places = np.searchsorted(bounds, (np.arange(columns) + 0.5) / columns).clip(max=len(wanted) - 1)
+    kinds = [list(wanted)[place] for place in places]
     for kind in wanted:
         if kind not in kinds:
             most = max(wanted, key=kinds.count)
@@ -143,7 +138,7 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
     return tuple(sorted(kinds, key=list(wanted).index))
 
 
-# ---- kinds of ground: (n + 1, n + 1) heights, flat in the middle and at zero along the rim, so that tiles fit together ----
+# ---- kinds of ground: (n + 1, n + 1) heights, flat in the middle and zero along the rim, so that tiles fit together
 
 
 @dataclass(frozen=True)
@@ -152,56 +147,54 @@ class Grid:
 
     n: int  # cells along an edge
     cell: float  # [m] between two vertices
-    pit: bool  # every second tile, along both axes: a pit if it is of a kind that goes up or down
+    pit: bool  # every second tile along both axes: kinds that go up or down make a pit
 
     @property
     def distance(self) -> Heights:
-        """From the middle, the larger of |x| and |y| [m]."""
+        """Distance from the middle, the larger of |x| and |y| [m]."""
         along = np.abs(np.arange(self.n + 1) - self.n / 2) * self.cell
         return np.maximum(along[:, None], along[None, :])
 
     @property
     def half(self) -> float:
-        """Half the edge [m]: the largest distance."""
+        """Half the edge [m], the largest distance."""
         return 0.5 * self.n * self.cell
 
     def zeros(self) -> Heights:
         return np.zeros((self.n + 1, self.n + 1))
 
     def fade(self, heights: Heights) -> Heights:
-        """``heights``, flat in the middle and, over the last 0.5 m, at zero along the rim."""
+        """Scale ``heights`` to 0 in the middle and, over the last 0.5 m, along the rim."""
         inside = np.clip((self.distance - PLATFORM) / 0.3, 0.0, 1.0)
         outside = np.clip((self.half - self.distance) / 0.5, 0.0, 1.0)
         return heights * inside * outside
 
 
-# of the grid, the difficulty from 0 to 1, and what is to be drawn from
+# function of the grid, the difficulty from 0 to 1, and the random generator
 Kind = Callable[[Grid, float, np.random.Generator], Heights]
 
 KINDS: dict[str, Kind] = {}
-# what makes a kind hard: name [unit], its value at difficulty 0 and 1
+# kind -> its measure of difficulty "name [unit]", and the values of that at difficulty 0 and 1
 MEASURES: dict[str, tuple[str, float, float]] = {}
-LEVEL: set[str] = set()  # kinds that are made of level pieces
+LEVEL: set[str] = set()  # kinds made of level pieces
 
 
 def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: bool = False) -> Callable[[Kind], Kind]:
     """Make the decorated function a kind of ground under its own name.
 
-    ``measure``: what makes it hard, with its unit, as in "depth [cm]"; ``low`` and ``high``: its value at difficulty 0 and 1.
-    ``level``: it is made of level pieces, such as steps and blocks, which MuJoCo's own engine and an export then have as boxes.
+    ``measure``: its measure of difficulty, such as "depth [cm]"; ``low`` and ``high``: values at difficulty 0 and 1.
+    ``level``: it consists of level pieces, such as steps; MuJoCo's own engine and exports make boxes of them.
     """
     if not isinstance(measure, str) or (measure and low == high):
-        raise ModelError(
-            f"add_kind({measure!r}, {low:g}, {high:g}): name what makes the kind hard and its value at difficulty 0 and 1, "
-            'as in @add_kind("depth [cm]", 5, 40), or write @add_kind()'
-        )
+        must = "name what makes the kind hard and its value at difficulty 0 and 1"
+        example = 'as in @add_kind("depth [cm]", 5, 40), or write @add_kind()'
+        raise ModelError(f"add_kind({measure!r}, {low:g}, {high:g}): {must}, {example}")
 
     def add(kind: Kind) -> Kind:
         name = kind.__name__
         if name in KINDS and KINDS[name].__module__ == __name__:
-            raise ModelError(
-                f"kind of terrain '{name}' is one of the package's own; give yours another name than {', '.join(KINDS)}"
-            )
+            instead = f"give yours another name than {', '.join(KINDS)}"
+            raise ModelError(f"kind of terrain '{name}' is one of the package's own; {instead}")
         KINDS[name] = kind
         MEASURES.pop(name, None)
         LEVEL.discard(name)
@@ -269,7 +262,7 @@ def waves(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
 
 @add_kind("gap [cm]", 100 * STONE_GAP[0], 100 * STONE_GAP[1], level=True)
 def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Square stones, 1.5 m down to 0.3 m, with gaps of 5 to 20 cm between them, 0.3 m deep [legged_gym; ours: less deep]."""
+    """Square stones of 1.5 m down to 0.3 m, with gaps of 5 to 20 cm, 0.3 m deep [legged_gym; ours: less deep]."""
     stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
     gap = max(round(_between(STONE_GAP, difficulty) / grid.cell), 1)
     heights = np.full((grid.n + 1, grid.n + 1), -0.3)
@@ -300,7 +293,7 @@ def low_random(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heigh
 
 
 def name_tile(kind: str, difficulty: float) -> str:
-    """A kind and how hard it is, in words: "stairs_up, step 12.8 cm"."""
+    """A kind with its measure of difficulty: "stairs_up, step 12.8 cm"."""
     if kind not in MEASURES:
         return kind
     name, value, unit = measure(kind, difficulty)
@@ -308,7 +301,7 @@ def name_tile(kind: str, difficulty: float) -> str:
 
 
 def measure(kind: str, difficulty: float) -> tuple[str, float, str]:
-    """What makes a kind that has a measure hard: its name, its value, the unit."""
+    """Name, value and unit of the measure of difficulty of ``kind``."""
     what, low, high = MEASURES[kind]
     name, _, unit = what.rstrip("]").partition(" [")
     return name, _between((low, high), difficulty), unit
@@ -326,7 +319,7 @@ def _stairs(grid: Grid, height: float, width: float = 0.3) -> Heights:
 
 
 def _noise(grid: Grid, height: float, every: float, rng: np.random.Generator) -> Heights:
-    """Uniform within +-``height``, drawn every ``every`` [m], straight lines between."""
+    """Uniform draws within +-``height`` at every ``every`` [m], interpolated between."""
     coarse = np.arange(0.0, 2.0 * grid.half + every, every)
     fine = np.arange(grid.n + 1) * grid.cell
     draws = rng.uniform(-height, height, (len(coarse), len(coarse)))

@@ -1,7 +1,5 @@
 """mujoco-warp behind fixed torch tensors: every view is the simulator's own memory."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import copy
@@ -25,10 +23,10 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError, unknown
 from legged_mw.utils.opaque import fast, not_traced
 
-wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
+wp.config.log_level = wp.LOG_WARNING  # else it prints a line for each kernel module
 
 _STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
-# What else a step leaves to the next one.
+# Other fields that carry over from step to step.
 _CARRIED = (
     "time",
     "act",
@@ -39,11 +37,11 @@ _CARRIED = (
     "mocap_quat",
     "history",
     "plastic",
-    "userdata",
 )
-# With 1 Newton and 5 line-search iterations these two are always set: they say "not converged", which is the plan.
+_CARRIED += ("userdata",)
+# With 1 Newton and 5 line-search iterations both bits are always set: they say "not converged", as intended.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
-# From this many Newton iterations on, a conditional loop in the graph is worth its launch.
+# With more Newton iterations a conditional loop in the graph pays for its launch.
 _UNROLLED_ITERATIONS = 10
 
 
@@ -65,8 +63,8 @@ class WarpSimulation(Simulation):
         terrain: Terrain | None = None,
         eager: bool = False,
     ) -> None:
-        """Allocate. On a CPU physics repeats bit for bit; on a GPU it does not: mujoco-warp 4.0.0 takes constraint rows
-        from an atomic counter, also in its deterministic mode, so sums differ in the last bit.
+        """Allocate. Physics repeats bit for bit on a CPU but not on a GPU: mujoco-warp 4.0.0 orders constraint rows by
+        an atomic counter, even in its deterministic mode, so sums differ in the last bit.
         """
         self.num_envs, self.device = num_envs, device
         self.nconmax, self.njmax = nconmax, njmax
@@ -74,14 +72,14 @@ class WarpSimulation(Simulation):
         self._eager = eager or not self._device.is_cpu
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
-            # else every world silently has the first one's
+            # else every world silently uses the first world's values
             derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()
             batched = [name for name in (*world_fields, *derived) if name != GRAVITY]
             self._model = make_model(model, terrain, dict.fromkeys(batched, num_envs))
             option = self._model.opt
             if GRAVITY in world_fields:
                 option.gravity = wp.array(np.tile(model.opt.gravity, (num_envs, 1)), dtype=wp.vec3)
-            option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
+            option.warn_overflow = 0  # we read the bits; printing from a kernel costs time
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
             shortcuts = fast("skip_kernels")
@@ -109,21 +107,15 @@ class WarpSimulation(Simulation):
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
-        # reset_data leaves the dead episode's values, even NaN
+        # reset_data leaves the old values, even NaN
         for stale in (self.actuator_force, self.site_xpos, self.xquat):
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
 
     def memory(self) -> dict[str, Tensor]:
-        own = {
-            name: wp.to_torch(getattr(self._data, name))
-            for name in (*_STATE, *_CARRIED)
-            if getattr(self._data, name).size
-        }
-        return {
-            **own,
-            "overflow_seen": self._overflow_seen,
-            **{f"model.{name}": value for name, value in self._fields.items()},
-        }
+        arrays = {name: getattr(self._data, name) for name in (*_STATE, *_CARRIED)}
+        own = {name: wp.to_torch(array) for name, array in arrays.items() if array.size}
+        fields = {f"model.{name}": value for name, value in self._fields.items()}
+        return {**own, "overflow_seen": self._overflow_seen, **fields}
 
     def set_constants(self) -> None:
         with wp.ScopedDevice(self._device):
@@ -143,17 +135,18 @@ class WarpSimulation(Simulation):
             raise_.append(f"njmax (now {self.njmax})")
         if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
             raise_.append(f"nconmax (now {self.nconmax})")
-        if OverflowType.CONTACT_MATCH in bits:  # more contacts than one sensor takes in
+        if OverflowType.CONTACT_MATCH in bits:  # more contacts than one sensor stores
             most = self._model.opt.contact_sensor_maxmatch
             raise_.append(f'<numeric name="contact_sensor_maxmatch" data="{2 * most}"/> in the MJCF (now {most})')
         advice = f"raise {' and '.join(raise_)}" if raise_ else "simpler geoms or fewer contacts may help"
-        return f"simulator overflow ({', '.join(str(bit.name) for bit in bits)}) in {worlds} of {self.num_envs} worlds; {advice}"
+        names = ", ".join(str(bit.name) for bit in bits)
+        return f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; {advice}"
 
     def actuator_velocity(self) -> Tensor:
         return wp.to_torch(self._data.actuator_velocity)
 
     def _substeps(self, which: Sequence[int], count: int) -> None:
-        """Sensors feed nothing back, so only the last of ``count`` substeps computes them: same state, a tenth less work."""
+        """Run substeps of a step of ``count``. Only the last computes sensors, which feed nothing back."""
         option = self._model.opt
         flags = option.disableflags
         for i in which:
@@ -185,7 +178,7 @@ def _check_fields(names: Sequence[str]) -> None:
 def make_model(
     model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None
 ) -> mjw.Model:
-    """The model on the current device; on ``terrain`` with contacts of our own in place of its height field's."""
+    """The model on the current device; with a ``terrain``, our own contacts replace those of its height field."""
     if terrain is None:
         return mjw.put_model(model, batch_sizes=batch_sizes)
     touch, model = touch_ground(model, model.geom(GROUND).id, terrain), copy.copy(model)
@@ -196,10 +189,7 @@ def make_model(
 
 
 def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]:
-    """``fn``, which only launches warp kernels, recorded on a CPU: a replay costs a tenth of the launches.
-
-    Recording runs nothing, so it costs no step.
-    """
+    """Record ``fn``, which only launches warp kernels. On a CPU a replay costs a tenth of the launches."""
     with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
         fn()
     graph = capture.graph
