@@ -111,7 +111,7 @@ def play() -> None:
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
-    from legged_mw.rl.export import export  # onnx takes a while to import
+    from legged_mw.export.exporter import export  # onnx takes a while to import
 
     return export(task, checkpoint, folder, half).text(folder)
 

@@ -33,6 +33,7 @@ TOOLS = (
     "legged_mw.view",
     "legged_mw.eval",
     "legged_mw.deploy",
+    "legged_mw.export",
     "legged_mw.robot",
     "legged_mw.drawing",
     "legged_mw.motion",
@@ -45,12 +46,12 @@ ONLY_IN = {
     "legged_mw.fast": ["legged_mw/fast/*"],
     "legged_mw.rl.students": [
         "legged_mw/rl/students/*",
-        "legged_mw/rl/export*.py",
+        "legged_mw/export/*",
         "legged_mw/eval/*",
         "legged_mw/view/*",
         "legged_mw/check/*",
     ],
-    "rsl_rl": ["legged_mw/rl/*"],
+    "rsl_rl": ["legged_mw/rl/*", "legged_mw/export/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     # a second to import, and only for a report
     "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],
@@ -71,7 +72,7 @@ ONLY_IN = {
     "legged_mw.drawing": [
         "legged_mw/drawing/*",
         "legged_mw/view/env_stage.py",
-        "legged_mw/rl/export_scene.py",
+        "legged_mw/export/scene.py",
         "legged_mw/eval/strip.py",
         "legged_mw/robot/picture.py",
         "legged_mw/motion/look.py",
@@ -80,12 +81,12 @@ ONLY_IN = {
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.tools": ["legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.deploy": [
-        *("legged_mw/deploy/*", "legged_mw/rl/export*.py", "legged_mw/eval/*", "legged_mw/programs.py"),
+        *("legged_mw/deploy/*", "legged_mw/export/*", "legged_mw/eval/*", "legged_mw/programs.py"),
         "examples/udp_robot.py",
     ],
-    "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
+    "legged_mw.export": ["legged_mw/export/*", "legged_mw/eval/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py", "legged_mw/tools/completion.py"],
-    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/network.py"],
+    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/export/network.py"],
     "cyclonedds": ["legged_mw/deploy/unitree/idl.py", "legged_mw/deploy/unitree/link.py"],
     "configs": ["configs/*", "examples/*"],
     "train": [],
@@ -175,17 +176,15 @@ def within(name: str, package: str) -> bool:
 
 
 def layer(name: str) -> int:
-    """Place of a module of the core in ``LAYERS``; -1 for all others. Exports are a tool."""
-    head, _, rest = name.removeprefix("legged_mw.").partition(".")
-    return (
-        LAYERS.index(head) if name.startswith("legged_mw.") and head in LAYERS and not rest.startswith("export") else -1
-    )
+    """Place of a module of the core in ``LAYERS``; -1 for all others."""
+    head = name.removeprefix("legged_mw.").partition(".")[0]
+    return LAYERS.index(head) if name.startswith("legged_mw.") and head in LAYERS else -1
 
 
 def against_the_layers(path: str, name: str) -> bool:
     """Whether ``path`` is of the core and imports a tool, or what stands above it."""
     here = layer(path.removesuffix(".py").replace("/", "."))
-    tool = any(within(name, package) for package in TOOLS) or name.startswith("legged_mw.rl.export")
+    tool = any(within(name, package) for package in TOOLS)
     return here >= 0 and (tool or layer(name) > here)
 
 
@@ -296,9 +295,9 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/envs/mirror.py", "from legged_mw.rl.symmetry import Mirrored", True),
         ("legged_mw/envs/legged_robot_config.py", "from legged_mw.rl.learner_config import RobotTaskCfgPPO", True),
         ("legged_mw/rl/symmetry.py", "from legged_mw.envs.mirror import Mirror", False),
-        ("legged_mw/rl/runner.py", "from legged_mw.rl.export import export", True),
-        ("legged_mw/rl/runner.py", "from legged_mw.rl.export_scene import standalone", True),
-        ("legged_mw/rl/export.py", "from legged_mw.rl.export_scene import standalone", False),
+        ("legged_mw/rl/runner.py", "from legged_mw.export.exporter import export", True),
+        ("legged_mw/rl/runner.py", "from legged_mw.export.scene import standalone", True),
+        ("legged_mw/export/exporter.py", "from legged_mw.export.scene import standalone", False),
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.view.stage import Stage", True),
         ("legged_mw/rl/training.py", "from legged_mw.robot.measure import measure", True),
         ("legged_mw/check/describe.py", "from legged_mw.robot.measure import measure", True),
@@ -314,6 +313,7 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.rl.students import estimator", True),
         ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.recorded import RememberingModel", False),
         ("legged_mw/eval/rollout.py", "from legged_mw.rl.students.recurrent import forget", False),
+        ("legged_mw/export/exporter.py", "from legged_mw.rl.students.recurrent import states_of", False),
         ("legged_mw/rl/runner.py", "import rsl_rl.runners", False),
         ("legged_mw/rl/runner.py", "from configs.go1_flat import TASK", True),
         ("configs/go1_rough.py", "from configs.go1_flat import Go1FlatCfg", False),
@@ -335,15 +335,15 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/deploy/unitree/client.py", "def f():\n    from cyclonedds.domain import Domain", True),
         ("legged_mw/deploy/unitree/link.py", "from cyclonedds.domain import Domain", False),
         ("legged_mw/deploy/runner.py", "import socket\nimport numpy as np\nimport mujoco", False),
-        ("legged_mw/rl/export.py", "from legged_mw.deploy.contract import Contract", False),
+        ("legged_mw/export/exporter.py", "from legged_mw.deploy.contract import Contract", False),
         ("legged_mw/rl/runner.py", "from legged_mw.deploy.contract import Contract", True),
         ("train.py", "from rsl_rl.runners import OnPolicyRunner", True),
         ("play.py", "from rsl_rl.models import MLPModel", True),
         ("legged_mw/rl/training.py", "from legged_mw.eval.training import make_exam", True),
-        ("legged_mw/rl/training.py", "from legged_mw.rl.export import export", True),
+        ("legged_mw/rl/training.py", "from legged_mw.export.exporter import export", True),
         ("legged_mw/rl/training.py", "from legged_mw.check.guard import check_recordable", True),
         ("legged_mw/programs.py", "from legged_mw.check.guard import check_recordable", False),
-        ("legged_mw/programs.py", "from legged_mw.rl.export import export", False),
+        ("legged_mw/programs.py", "from legged_mw.export.exporter import export", False),
     ],
 )
 def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> None:

@@ -22,7 +22,7 @@ from legged_mw.check.describe import describe
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.network import run_onnx
+from legged_mw.export.network import run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner

@@ -564,7 +564,7 @@ NOT_TO_TRAIN = [
         "legged_mw.deploy",
         "legged_mw.robot.picture",
         "legged_mw.drawing",
-        "legged_mw.rl.export",
+        "legged_mw.export",
         "legged_mw.tools",
     ),
 ]

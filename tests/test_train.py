@@ -30,7 +30,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.network import save_onnx
+from legged_mw.export.network import save_onnx
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.report import console_rows, curves
 from legged_mw.rl.runner import Runner, make_runner

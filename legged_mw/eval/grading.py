@@ -120,7 +120,7 @@ def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask
 
 def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
     """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
-    from legged_mw.rl.export import export  # onnx takes a while to import
+    from legged_mw.export.exporter import export  # onnx takes a while to import
 
     if active(graded.task.cfg):
         print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")

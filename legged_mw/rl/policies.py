@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.utils import resolve_class
@@ -16,7 +17,6 @@ from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import actor_settings, check_classes, network_section
 from legged_mw.rl.memory_check import check_room
-from legged_mw.rl.network import LEARNING_ONLY, read_parameters
 from legged_mw.rl.runs import (
     CONFIG_FILE,
     check_fit,
@@ -33,6 +33,16 @@ from legged_mw.utils.files import check_folder, finish_moving, typed
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 NETWORK_FILE = "policy.onnx"  # of an export: legged_mw.deploy, which imports nothing from here, calls it so too
+MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "state_in", "state_out", "estimate"
+PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
+MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
+LEARNING_ONLY = "teacher."  # parameters that nothing needs to act
+# neither a mean action nor an estimate needs them
+UNWRITTEN = (
+    "distribution.",
+    LEARNING_ONLY,
+    *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")),
+)
 
 
 class Source(NamedTuple):
@@ -180,3 +190,46 @@ def act(policy: MLPModel, obs: TensorDict) -> Tensor:
     """The policy's mean action (N, A), without gradients."""
     with torch.inference_mode():
         return policy(obs)
+
+
+# ---- reading the network of an export ---------------------------------------------------------------------------------
+
+
+def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
+    """The parameters of ``policy`` by name, as an export wrote them to ``path``: bit for bit, so that it acts as the exported one.
+
+    The noise of exploration and the normalizer's count and variance are not in the file; ``policy`` keeps its own.
+    """
+    import onnx
+    from onnx import numpy_helper
+
+    try:
+        graph = onnx.load(path, load_external_data=False).graph
+        stored = {
+            each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer
+        }
+    except FileNotFoundError:
+        raise ConfigError(f"no policy at {path}") from None
+    except Exception:  # protobuf's or onnx's, by how the file is broken
+        raise ConfigError(f"{path} cannot be read as an ONNX network: it is damaged") from None
+    found = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
+    if not found:
+        names = ", ".join(list(stored)[:3]) or "none"
+        raise ConfigError(
+            f"{path} is no network that this project exported: its weights are called {names}, not {PREFIX}mlp.0.weight ..."
+        )
+    if MEAN in found and STD not in found:
+        found[STD] = _divisor(graph, stored, path) - getattr(policy.obs_normalizer, "eps", 0.0)
+    return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | found
+
+
+def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
+    """std + eps of the normalizer, which the exporter adds up and names as it likes: the network begins with (obs - mean) / divisor.
+
+    Less eps, rounded, plus eps, rounded, it is the same float32 again, as it was made by such a sum.
+    """
+    centred = [node.output[0] for node in graph.node if PREFIX + MEAN in node.input]
+    for node in graph.node:
+        if node.op_type == "Div" and node.input[0] in centred and node.input[1] in stored:
+            return stored[node.input[1]]
+    raise ConfigError(f"{path} is no network that this project exported: it does not begin with (obs - mean) / std")

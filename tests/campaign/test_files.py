@@ -657,7 +657,7 @@ class _Killed(BaseException):
 
 def move_in(folder: Path, new: Path, last: int) -> int:
     """An export of the files in ``new`` to ``folder``, killed before the call ``last`` of the file system; returns how many it makes."""
-    from legged_mw.rl.export import _all_or_nothing
+    from legged_mw.export.exporter import _all_or_nothing
 
     calls, real = 0, {name: getattr(os, name) for name in ("replace", "unlink", "rmdir", "mkdir", "open", "fsync")}
 

@@ -17,8 +17,8 @@ from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.network import MEMORY_OUTPUT, run_onnx
-from legged_mw.rl.policies import act
+from legged_mw.export.network import run_onnx
+from legged_mw.rl.policies import MEMORY_OUTPUT, act
 from legged_mw.rl.students.recurrent import forget, memory_of
 from legged_mw.sim.simulation import say_overflow
 from legged_mw.skills.motion_tracking import MotionTracking

@@ -1,7 +1,4 @@
-"""A policy's network as an ONNX file: writing it, halving it, running it, and reading its weights back.
-
-onnx is imported where a file is written or read: a training begins without.
-"""
+"""A policy's network as an ONNX file: writing it, halving it, running it."""
 
 from __future__ import annotations
 
@@ -16,18 +13,9 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from legged_mw.utils.config import ConfigError
+from legged_mw.rl.policies import MEMORY_INPUT, PREFIX
 
-INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"
-PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
-MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
-LEARNING_ONLY = "teacher."  # parameters that nothing needs to act
-# neither a mean action nor an estimate needs them
-UNWRITTEN = (
-    "distribution.",
-    LEARNING_ONLY,
-    *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")),
-)
+INPUT, OUTPUT = "obs", "actions"
 
 
 class ExportedPolicy(nn.Module):
@@ -146,46 +134,3 @@ def halve(policy: MLPModel, path: Path) -> None:
     del graph.node[:]
     graph.node.extend(nodes)
     onnx.save(model, path)
-
-
-# ---- reading -------------------------------------------------------------------------------------------------------
-
-
-def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
-    """The parameters of ``policy`` by name, as an export wrote them to ``path``: bit for bit, so that it acts as the exported one.
-
-    The noise of exploration and the normalizer's count and variance are not in the file; ``policy`` keeps its own.
-    """
-    import onnx
-    from onnx import numpy_helper
-
-    try:
-        graph = onnx.load(path, load_external_data=False).graph
-        stored = {
-            each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer
-        }
-    except FileNotFoundError:
-        raise ConfigError(f"no policy at {path}") from None
-    except Exception:  # protobuf's or onnx's, by how the file is broken
-        raise ConfigError(f"{path} cannot be read as an ONNX network: it is damaged") from None
-    found = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
-    if not found:
-        names = ", ".join(list(stored)[:3]) or "none"
-        raise ConfigError(
-            f"{path} is no network that this project exported: its weights are called {names}, not {PREFIX}mlp.0.weight ..."
-        )
-    if MEAN in found and STD not in found:
-        found[STD] = _divisor(graph, stored, path) - getattr(policy.obs_normalizer, "eps", 0.0)
-    return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | found
-
-
-def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
-    """std + eps of the normalizer, which the exporter adds up and names as it likes: the network begins with (obs - mean) / divisor.
-
-    Less eps, rounded, plus eps, rounded, it is the same float32 again, as it was made by such a sum.
-    """
-    centred = [node.output[0] for node in graph.node if PREFIX + MEAN in node.input]
-    for node in graph.node:
-        if node.op_type == "Div" and node.input[0] in centred and node.input[1] in stored:
-            return stored[node.input[1]]
-    raise ConfigError(f"{path} is no network that this project exported: it does not begin with (obs - mean) / std")
