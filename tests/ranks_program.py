@@ -16,10 +16,9 @@ from pathlib import Path
 import torch
 from learner import parameters
 
-from legged_mw.rl.plan import Plan
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import leave_together, this_rank
-from legged_mw.rl.runner import make_runner
+from legged_mw.rl.runner import Plan, make_runner
 from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.task import load_task
 

@@ -292,9 +292,9 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/sim/model.py", "from legged_mw.envs.mirror import Mirror", True),
         ("legged_mw/sim/model.py", "def f():\n    from legged_mw.robot.vendor import read_robot", False),
         ("legged_mw/sim/joints.py", "from legged_mw.robot.vendor import read_robot", True),
-        ("legged_mw/envs/mirror.py", "from legged_mw.rl.symmetry import Mirrored", True),
+        ("legged_mw/envs/mirror.py", "from legged_mw.rl.rsl_rl_settings import Mirrored", True),
         ("legged_mw/envs/legged_robot_config.py", "from legged_mw.rl.learner_config import RobotTaskCfgPPO", True),
-        ("legged_mw/rl/symmetry.py", "from legged_mw.envs.mirror import Mirror", False),
+        ("legged_mw/rl/rsl_rl_settings.py", "from legged_mw.envs.mirror import Mirror", False),
         ("legged_mw/rl/runner.py", "from legged_mw.export.exporter import export", True),
         ("legged_mw/rl/runner.py", "from legged_mw.export.scene import standalone", True),
         ("legged_mw/export/exporter.py", "from legged_mw.export.scene import standalone", False),
@@ -311,7 +311,7 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/sim/graph.py", "if TYPE_CHECKING:\n    import legged_mw.envs", True),
         ("legged_mw/rl/ppo.py", "from legged_mw.rl.students.recurrent import HiddenState", True),
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.rl.students import estimator", True),
-        ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.recorded import RememberingModel", False),
+        ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.ppo import RememberingModel", False),
         ("legged_mw/eval/rollout.py", "from legged_mw.rl.students.recurrent import forget", False),
         ("legged_mw/export/exporter.py", "from legged_mw.rl.students.recurrent import states_of", False),
         ("legged_mw/rl/runner.py", "import rsl_rl.runners", False),
@@ -357,7 +357,7 @@ def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> No
         # the config's default, the table of classes that a config may name, and where an old run's class is now
         (
             "legged_mw.rl.students",
-            ["legged_mw/rl/classes.py", "legged_mw/rl/learner_config.py", "legged_mw/utils/renamed.py"],
+            ["legged_mw/rl/learner_config.py", "legged_mw/rl/rsl_rl_settings.py", "legged_mw/utils/renamed.py"],
         ),
     ],
 )

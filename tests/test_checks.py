@@ -17,7 +17,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.check.own_class import PAYS, WITHOUT, check_class
-from legged_mw.rl.health import Health
+from legged_mw.rl.iteration_log import Health
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types

@@ -16,7 +16,7 @@ import yaml
 from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
-from legged_mw.rl.classes import check_classes
+from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
 from legged_mw.utils.renamed import RENAMED

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl import plan as planning
-from legged_mw.rl.plan import Plan
-from legged_mw.rl.runner import Runner, make_runner
+from legged_mw.rl import runner as planning
+from legged_mw.rl.runner import Plan, Runner, make_runner
 from legged_mw.utils.task import LoadedTask, load_task
 
 

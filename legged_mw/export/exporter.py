@@ -39,7 +39,7 @@ from legged_mw.export.network import (
 )
 from legged_mw.export.replay import ExportError, record, replay
 from legged_mw.rl.policies import ESTIMATE, MEMORY_INPUT, MEMORY_OUTPUT, load_policy
-from legged_mw.rl.runs import CONFIG_FILE
+from legged_mw.rl.run_folder import CONFIG_FILE
 from legged_mw.rl.students.estimator import EstimatingModel
 from legged_mw.rl.students.recurrent import states_of
 from legged_mw.utils.config import save_yaml

@@ -55,7 +55,7 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
 def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Where ``--task`` is missing, take the one that the run at the path ``--load_run`` is of."""
     if not args.task and args.load_run:
-        from legged_mw.rl.runs import task_at  # with torch
+        from legged_mw.rl.run_folder import task_at  # with torch
 
         args.task = task_at(args.load_run)
     if not args.task:

@@ -10,28 +10,86 @@ normalisers' std) is copied into tensors that stay. Actor and critic share nothi
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.extensions import Symmetry
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules import EmpiricalNormalization
+from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import FlatAdam, make_recordable
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.statistics import BOUND
+from legged_mw.rl.adam import FlatAdam, make_recordable, plain_state
 from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
 from legged_mw.rl.losses import own_std, policy_loss, value_loss
-from legged_mw.rl.recorded import Memories, Recorded, RegressingModel, Sequenced, trained_parts, why_stock
-from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
 _MIN_RATE, MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
+
+
+class Recorded:
+    """Stands before rsl-rl's algorithm among the parents of a learner. Where ``graphed`` is false all is rsl-rl's own."""
+
+    graphed: bool
+    learning_rate: float
+    optimizer: Any
+    device: str
+    _rates: Sequence[Tensor | float]  # of the optimizer's groups
+    _memories: Memories
+
+    def _begin(self) -> None:
+        """Fixed tensors, and graphs that are not recorded yet."""
+        raise NotImplementedError
+
+    def release(self) -> None:
+        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
+        if self.graphed:
+            self._begin()
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
+        """Store the transition; worlds whose episode ended are forgotten."""
+        super().process_env_step(obs, rewards, dones, extras)  # type: ignore[misc]
+        if self.graphed:
+            self._memories.forget(dones)
+
+    def save(self) -> dict[str, Any]:
+        """The networks' and the optimizer's state, in the form that rsl-rl's own learner writes."""
+        content = super().save()  # type: ignore[misc]
+        if self.graphed:
+            rates = [self.learning_rate, *map(float, self._rates[1:])]
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
+        return content
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Take over a checkpoint of this class or of rsl-rl's own learner; a student its teacher also from one of PPO."""
+        iteration = super().load(loaded_dict, load_cfg, strict)  # type: ignore[misc]
+        if self.graphed:
+            make_recordable(self.optimizer, self._rates, str(self.device))
+            self._begin()  # Adam's memory has moved
+        return iteration
+
+
+def why_stock(learner: Any, policy: MLPModel, other: MLPModel, regressing: MLPModel) -> str | None:
+    """What keeps a learner of two networks from being recorded, or None. Only ``regressing`` may be a RegressingModel."""
+    for network in (policy, other):
+        known = type(network) is MLPModel or isinstance(network, RememberingModel)
+        if not known and not (network is regressing and isinstance(network, RegressingModel)):
+            return f"a network is a {type(network).__name__}"
+    if learner.use_mixed_precision:
+        return "use_mixed_precision is set"
+    if getattr(type(policy.distribution), "sample", None) is not GaussianDistribution.sample:
+        return f"actions are drawn from a {type(policy.distribution).__name__}"
+    if type(learner.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
+        return f"the optimizer is {type(learner.optimizer).__name__}"
+    return None
 
 
 class Minibatch(NamedTuple):
@@ -426,3 +484,192 @@ def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | N
             "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
             "update; switch the former on, or both off"
         )
+
+
+# ---- networks that are more than an MLP -----------------------------------------------------------------------------
+
+
+# What a network with a memory reads of a rollout in an update; its memory knows what is in it.
+Sequenced = tuple[Tensor, ...]
+
+
+class RegressingModel(MLPModel):
+    """rsl-rl's MLPModel with an ``estimator``, which learns by regression; the network reads what it makes of the observations."""
+
+    field: str  # of the config, that asks for it
+    regression: str  # the name of the regression's loss
+    estimator: nn.Module
+    learning_rate: float  # of the estimator
+
+    @staticmethod
+    def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+        """What its constructor takes besides MLPModel's, from the learner's config; see ``classes.actor_settings``. Raises ConfigError."""
+        raise NotImplementedError
+
+    def rollout_latent(self, obs: TensorDict) -> Tensor:
+        """What the network reads in a training's rollout, of all its worlds in order."""
+        return self.get_latent(obs)
+
+    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """What ``learn`` needs besides the latent; it stays the same over an update.
+
+        ``obs`` (S * B,) were seen in ``worlds`` (B,); S is 2 where mirror images come after them, else 1.
+        """
+        raise NotImplementedError
+
+    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The network's output, and the loss () of the regression, which is of other parameters.
+
+        ``latent`` may have more columns, of zeros.
+        """
+        raise NotImplementedError
+
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
+        """Update the normaliser of what the estimator learns from."""
+        raise NotImplementedError
+
+
+def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
+    """Parameters whose gradients are clipped together: the policy's, the critic's, the estimator's if there is one; and its rate ()."""
+    if not isinstance(actor, RegressingModel):
+        return [[*actor.parameters()], [*critic.parameters()]], []
+    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
+    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
+    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
+
+
+class Memory(Protocol):
+    """The state of a recurrent network in each of N worlds, in tensors that stay."""
+
+    now: Tensor  # (states, S, N, H): S is 2 where mirror images have a state of their own, else 1
+    start: Tensor  # when the rollout began
+
+    def advance(self, obs: Any) -> Tensor:
+        """Take in observations (N,), or (2N,) with their images; returns what the MLP reads (N, H)."""
+        ...
+
+    def normalised(self, obs: Any) -> Tensor:
+        """What the recurrent part reads of observations (B,): (B, size)."""
+        ...
+
+    def forget(self, ended: Tensor) -> None:
+        """The state becomes 0 where ``ended`` (N,)."""
+
+    def for_rsl_rl(self) -> Any:
+        """A copy of the state in rsl-rl's form."""
+
+    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequenced:
+        """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and where a step ended an episode, ``dones`` (T, N, 1)."""
+        ...
+
+    def unroll(self, sequence: Sequenced) -> Tensor:
+        """What the MLP reads (S * T * B, H) of a sequence, with gradients."""
+        ...
+
+
+class RememberingModel(RNNModel):
+    """rsl-rl's recurrent network, which a recorded learner gives a memory of its own."""
+
+    def memory(self, worlds: int, images: int, device: str) -> Memory:
+        """An empty memory; with ``images`` 2 also of what the network has seen of mirror images."""
+        raise NotImplementedError
+
+
+class Memories(dict[nn.Module, Memory]):
+    """Those of the networks with a memory among a learner's ``models``."""
+
+    def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
+        remembering = [model for model in models if isinstance(model, RememberingModel)]
+        super().__init__({model: model.memory(worlds, images, device) for model in remembering})
+
+    def begin_rollout(self) -> None:
+        """Keep the present states as those that the rollout begins with."""
+        for memory in self.values():
+            memory.start.copy_(memory.now)
+
+    def forget(self, ended: Tensor) -> None:
+        """All states become 0 where ``ended`` (N,)."""
+        for memory in self.values():
+            memory.forget(ended)
+
+
+# ---- the rollback of an update --------------------------------------------------------------------------------------
+
+
+class Undo:
+    """What a learner has learned, as it was before an update and after it: call ``remember``, update, ``settle``."""
+
+    def __init__(self, learner: Any, networks: Iterable[nn.Module]) -> None:
+        """``learner`` has rsl-rl's ``storage`` and ``optimizer``; ``networks`` are those that learn."""
+        self._learner, self._networks, stored = learner, list(networks), learner.storage.observations
+        self.columns = [(group, i) for group in stored.keys() for i in range(stored[group][0, 0].numel())]  # noqa: SIM118 (a TensorDict)
+        device = learner.storage.rewards.device
+        self.undone = torch.zeros((), device=device)  # 1: the last update was
+        # 1 where it had such a value: by columns, and last rewards
+        self.wrong = torch.zeros(len(self.columns) + 1, device=device)
+
+    def _learned(self) -> dict[str, Tensor]:
+        """Parameters, normalisers, the optimizer's memory and the learning rates, by name: rsl-rl's own normaliser rebinds its std."""
+        optimizer, values = self._learner.optimizer, dict[str, Any]()
+        for i, network in enumerate(self._networks):
+            values |= {f"{i}.{name}": value for name, value in (*network.named_parameters(), *network.named_buffers())}
+        for i, memory in enumerate(optimizer.state.values()):
+            values |= {f"memory {i}.{name}": value for name, value in memory.items()}
+        values |= {f"rate {i}": group["lr"] for i, group in enumerate(optimizer.param_groups)}
+        values["rate"] = getattr(self._learner, "_rate", None)
+        return {name: value for name, value in values.items() if isinstance(value, Tensor) and value.numel()}
+
+    @torch.no_grad()
+    def remember(self) -> None:
+        """What is learned now is good."""
+        self._before = [(list(kind), _join(kind.values())) for kind in _kinds(self._learned())]
+
+    @torch.no_grad()
+    def settle(self, losses: Tensor | None = None) -> None:
+        """After the update, whose ``losses`` are known: put everything back if it is not sound, and note that."""
+        stored = self._learner.storage
+        wrong = [_beyond(value.flatten(0, 1).flatten(1)) for value in (*stored.observations.values(), stored.rewards)]
+        self.wrong.copy_(torch.cat([*wrong[:-1], wrong[-1].any()[None]]))
+        sound = ~self.wrong.any() if losses is None else losses.isfinite().all() & ~self.wrong.any()
+        new, states = self._learned(), list[tuple[list[Tensor], Tensor, Tensor]]()
+        for names, before in self._before:
+            kind = [new.pop(name) for name in names]
+            states.append((kind, before, _join(kind)))
+        # Adam's memory, of its first step: it begins with zeros
+        for kind in [list(kind.values()) for kind in _kinds(new)]:
+            states.append((kind, torch.zeros_like(after := _join(kind)), after))
+        for _, _, after in states:
+            sound = sound & _on(after.isfinite().all(), sound.device)
+        if getattr(self._learner, "is_multi_gpu", False):
+            shared = sound.float()
+            torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MIN)
+            sound = shared > 0.5
+        self.undone.copy_(~sound)
+        for kind, before, after in states:
+            parts = torch.where(_on(sound, after.device), after, before).split([value.numel() for value in kind])
+            shaped = [part.view_as(value) for part, value in zip(parts, kind, strict=True)]
+            torch._foreach_copy_(kind, shaped)  # pyright: ignore[reportPrivateImportUsage]
+        del self._before
+
+
+def _kinds(tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
+    """The tensors by type and device: what can be joined."""
+    kinds: dict[Any, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        kinds.setdefault((tensor.dtype, tensor.device), {})[name] = tensor
+    return list(kinds.values())
+
+
+def _on(value: Tensor, device: torch.device) -> Tensor:
+    """``value`` on ``device``: rsl-rl's own Adam counts its steps on the host."""
+    return value if value.device == device else value.to(device)
+
+
+def _join(tensors: Iterable[Tensor]) -> Tensor:
+    return torch.cat([tensor.reshape(-1) for tensor in tensors])
+
+
+def _beyond(values: Tensor) -> Tensor:
+    """(C,) Columns of ``values`` (B, C) that hold what is not finite or beyond BOUND."""
+    low, high = torch.aminmax(values, dim=0)
+    return ~((low >= -BOUND) & (high <= BOUND))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, Self
 
 import torch
 from rsl_rl.algorithms import Distillation
@@ -19,23 +21,34 @@ from torch import Tensor, nn
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import DivergenceStop
-from legged_mw.rl.checkpoint import check_resume
-from legged_mw.rl.health import Health
-from legged_mw.rl.keeping import Keeper, reason_of
+from legged_mw.rl.checkpoint import (
+    check_fit,
+    check_resume,
+    load_tensors,
+    random_state,
+    save_whole,
+    set_random_state,
+    take_worlds,
+    worlds_content,
+)
+from legged_mw.rl.iteration_log import (
+    Clock,
+    Console,
+    Health,
+    Mark,
+    Message,
+    Report,
+    console_rows,
+    curves,
+    quiet_writers,
+)
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
-from legged_mw.rl.plan import Plan
 from legged_mw.rl.policies import acting
-from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.progress import Console
+from legged_mw.rl.ppo import GraphedPPO, RegressingModel, Undo
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
-from legged_mw.rl.recorded import RegressingModel
-from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
-from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
-from legged_mw.rl.runs import check_fit, load_tensors, save_whole
-from legged_mw.rl.settings import rsl_rl_config
-from legged_mw.rl.threads import UpdateThreads
+from legged_mw.rl.rsl_rl_settings import rsl_rl_config
+from legged_mw.rl.run_folder import Keeper, reason_of
 from legged_mw.rl.transfer import TEACHER, adapt
-from legged_mw.rl.undo import Undo
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -437,3 +450,132 @@ def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
     """Name what has no mirror image now, not after a rollout, if learning wants one. Raises ConfigError."""
     if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
         _ = env.mirror
+
+
+# ---- how far a training is ------------------------------------------------------------------------------------------
+
+
+_WINDOW = 50  # iterations whose median duration says how many more the time has room for
+
+
+class Plan:
+    """What a training was asked for, and how much of it is ``done``: 0 in its first iteration, 1 in its last, never less than before.
+
+    With a ``deadline`` the number of the last iteration is not known at first: it is estimated anew after each iteration, and ``done``
+    goes to 1 in even steps over those that are left. So kernels that compile, exams and checkpoints change the steps and not the end.
+    """
+
+    def __init__(self, last: int = 0, deadline: float | None = None, used: float = 0.0) -> None:
+        """Until the iteration ``last``, or until ``deadline`` [s, time.time()], after ``used`` seconds of an earlier training."""
+        self.last = self._wanted = last  # the last iteration: with a deadline an estimate
+        self.deadline, self._used, self._begun = deadline, used, time.time()
+        room = max(deadline - self._begun, 0.0) if deadline else 0.0
+        self.done = used / (used + room) if room else 0.0
+        self._first, self._before, self._times = True, self._begun, deque[float](maxlen=_WINDOW)
+
+    @property
+    def seconds(self) -> float:
+        """Time that training has taken, resumed or not, for a later one with a deadline [s]; 0: nobody has asked for time."""
+        return self._used + time.time() - self._begun if self.deadline or self._used else 0.0
+
+    def saved(self) -> dict[str, float]:
+        """What a checkpoint holds of it; nothing, where nobody has asked for time: such trainings are equal to the bit."""
+        return {"seconds": seconds} if (seconds := self.seconds) else {}
+
+    def begin(self, iteration: int) -> float:
+        """The iteration after so many begins: how much is done by then."""
+        share = iteration / max(self._wanted - 1, 1)
+        if self.deadline:
+            step = 0.0 if self._first else (1.0 - self.done) / max(self.last - iteration, 1)
+            share = max(self.done + step, share)
+        self._first, self.done = False, min(share, 1.0)
+        return self.done
+
+    def room(self) -> float:
+        """An iteration has ended: how many more there is time for, by the median of the last ones; inf until one can say."""
+        now = time.time()
+        self._times.append(now - self._before)
+        self._before = now
+        if self.deadline is None or (len(self._times) == 1 and now < self.deadline):
+            return math.inf  # the first one may have compiled kernels
+        pace = median(self._times if len(self._times) in (1, _WINDOW) else list(self._times)[1:])
+        return float(max(0, round((self.deadline - now) / max(pace, 1e-9))))
+
+    def hear(self, iteration: int, room: float) -> None:
+        """After ``iteration`` there was time for ``room`` more."""
+        self.last = int(min(self._wanted, iteration + room))
+
+
+# ---- threads of an update on a CPU ----------------------------------------------------------------------------------
+
+
+_SLOW = 3.0  # ours: times the one before, from which on an update on all cores is looked into; noise stays below 2
+_GAIN = 1.2  # ours: times faster that the other number must be to change to it
+_PATIENCE = 50  # ours: updates on one thread before all cores are tried again; doubled each time that does not help
+
+
+class ThreadChoice:
+    """Which number of threads the next update takes, from what those before took. No clock, no torch."""
+
+    def __init__(self, few: int, many: int) -> None:
+        self.few, self.many = few, many
+        # what was chosen; what the next update takes: first the one that cannot be very slow
+        self.settled, self.threads = many, few
+        self._times: dict[int, float] = {}  # threads -> [s] of the last update on as many
+        self._warm, self._since, self._patience = False, 0, _PATIENCE
+
+    def took(self, seconds: float) -> str:
+        """Take note of an update's time; returns what to say if the choice has changed, else ''."""
+        if not self._warm:  # the first one allocates, too
+            self._warm = True
+            return ""
+        before, self._times[self.threads] = self._times.get(self.threads), seconds
+        if len(self._times) < 2:
+            self.threads = self.many
+            return ""
+        if before is None or self.threads != self.settled:  # it was a trial
+            return self._settle()
+        self._since += 1
+        if self.settled == self.many and seconds > _SLOW * before:
+            self.threads = self.few
+        elif self.settled == self.few and self._since >= self._patience:
+            self.threads = self.many
+        return ""
+
+    def _settle(self) -> str:
+        before, self.settled = self.settled, better(self._times, self.settled)
+        self._patience = 2 * self._patience if self.settled == before == self.few else _PATIENCE
+        self.threads, self._since = self.settled, 0
+        if self.settled == before:
+            return ""
+        took = " and ".join(f"{self._times[threads]:.2g} s on {threads}" for threads in (before, self.settled))
+        return f"threads of an update: {took}; going on with {self.settled} (cpu.update_threads = 0)"
+
+
+def better(times: dict[int, float], settled: int) -> int:
+    """The number of threads to go on with: ``settled``, unless another one gains enough."""
+    quickest = min(times, key=lambda threads: times[threads])
+    return quickest if _GAIN * times[quickest] < times[settled] else settled
+
+
+class UpdateThreads:
+    """Around each update: sets torch's threads, and puts them back, since a step's small operations want one.
+
+    ``asked`` 0 means as many of ``cores`` as are fastest, tried again when an update takes far longer than usual.
+    """
+
+    def __init__(self, asked: int, cores: int) -> None:
+        self._fixed = asked or cores
+        self._choice = ThreadChoice(1, cores) if not asked and cores > 1 else None
+
+    def __enter__(self) -> Self:
+        self._before = torch.get_num_threads()
+        torch.set_num_threads(self._choice.threads if self._choice else self._fixed)
+        self._begun = time.perf_counter()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        seconds = time.perf_counter() - self._begun
+        torch.set_num_threads(self._before)
+        if self._choice and error[0] is None and (text := self._choice.took(seconds)):
+            print(text, flush=True)

@@ -21,15 +21,22 @@ from rsl_rl.algorithms import Distillation
 
 from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.classes import check_classes
-from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
-from legged_mw.rl.memory_check import check_room
 from legged_mw.rl.policies import Trained, find_trained
-from legged_mw.rl.ppo import MAX_RATE
+from legged_mw.rl.ppo import MAX_RATE, Recorded
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
-from legged_mw.rl.recorded import Recorded
+from legged_mw.rl.rsl_rl_settings import check_classes, check_room
+from legged_mw.rl.run_folder import (
+    CONFIG_FILE,
+    LOCK_FILE,
+    Keeper,
+    RunLock,
+    experiment_folder,
+    find_checkpoint,
+    find_run,
+    new_run,
+    reason_of,
+)
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
 from legged_mw.rl.transfer import (
     TEACHER,
     attach_teacher_observations,

@@ -17,7 +17,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.policies import LEARNING_ONLY, NETWORK_FILE, Trained, read_actor
-from legged_mw.rl.runs import CONFIG_FILE, checkpoints
+from legged_mw.rl.run_folder import CONFIG_FILE, checkpoints
 from legged_mw.utils.commands import command_table
 from legged_mw.utils.config import ConfigError, save_yaml
 from legged_mw.utils.errors import shown, unknown

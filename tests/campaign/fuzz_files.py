@@ -32,8 +32,8 @@ from legged_mw.deploy.contract import checksum, edits, read_contract
 from legged_mw.deploy.motors import NetworkMotors
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet
+from legged_mw.rl.checkpoint import save_whole
 from legged_mw.rl.runner import Runner, make_runner
-from legged_mw.rl.runs import save_whole
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError

@@ -21,12 +21,11 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Observations
 from legged_mw.envs.statistics import NonFinite
 from legged_mw.rl import ppo
-from legged_mw.rl.health import Health
+from legged_mw.rl.iteration_log import Health
 from legged_mw.rl.losses import value_loss
-from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.ppo import GraphedPPO, Undo
+from legged_mw.rl.run_folder import checkpoints
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import checkpoints
-from legged_mw.rl.undo import Undo
 
 BAD = [math.nan, math.inf, -math.inf, 1e20, -1e38]
 RUN = ["--num_envs", "8", "--eager", "--seed", "1", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]

@@ -21,11 +21,10 @@ from test_resume import EXACTLY
 from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT
-from legged_mw.rl import runs, training
-from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock
+from legged_mw.rl import checkpoint, training
 from legged_mw.rl.ranks import Rank
+from legged_mw.rl.run_folder import LOCK_FILE, Keeper, RunLock, checkpoints
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.console import SafeStream
 
@@ -71,7 +70,7 @@ def test_a_checkpoint_that_cannot_be_written_is_said_and_the_next_one_tried(
             raise OSError(code, os.strerror(code))
         replace(source, target)
 
-    monkeypatch.setattr(runs.os, "replace", fail)
+    monkeypatch.setattr(checkpoint.os, "replace", fail)
     worlds = list[list[str]]()
     before_iteration(monkeypatch, lambda *_: worlds.append([path.name for path in only_run(tmp_path).glob("worlds_*")]))
     result = train(tmp_path, 4)
@@ -95,7 +94,7 @@ def test_a_full_disk_keeps_the_newest_that_could_be_written(tmp_path: Path, monk
 
     def fill(_: Runner, iteration: int) -> None:
         if iteration == 3:
-            monkeypatch.setattr(runs, "open", lambda path, mode: Full(path, mode), raising=False)
+            monkeypatch.setattr(checkpoint, "open", lambda path, mode: Full(path, mode), raising=False)
             monkeypatch.setattr(RecordWriter, "write", lambda *_: Full(tmp_path / "curve", "wb").write(b""))
 
     before_iteration(monkeypatch, fill)
@@ -273,7 +272,7 @@ def test_a_run_that_is_being_trained_is_not_resumed(tmp_path: Path) -> None:
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
-    program = "import sys, time\nfrom pathlib import Path\nfrom legged_mw.rl.keeping import RunLock\n"
+    program = "import sys, time\nfrom pathlib import Path\nfrom legged_mw.rl.run_folder import RunLock\n"
     program += "lock = RunLock(Path(sys.argv[1]))\nlock.begin()\nprint(1, flush=True)\ntime.sleep(60)"
     child = subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True

@@ -11,10 +11,8 @@ import pytest
 import torch
 from program import SMALL, Result, assert_equal, load, refused, run, trained
 
-from legged_mw.rl.checkpoint import Checker
-from legged_mw.rl.keeping import Keeper
-from legged_mw.rl.resume import beyond
-from legged_mw.rl.runs import checkpoints, save_whole
+from legged_mw.rl.checkpoint import Checker, beyond, save_whole
+from legged_mw.rl.run_folder import Keeper, checkpoints
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = [

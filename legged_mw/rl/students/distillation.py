@@ -17,9 +17,8 @@ from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
-from legged_mw.rl.recorded import Memories, Recorded, why_stock
+from legged_mw.rl.ppo import Memories, Recorded, Undo, why_stock
 from legged_mw.rl.students.recurrent import step
-from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from legged_mw.rl.layers import Linear, sum_rows
 from legged_mw.rl.policies import MEMORY_INPUT, MEMORY_OUTPUT
-from legged_mw.rl.recorded import RememberingModel, Sequenced
+from legged_mw.rl.ppo import RememberingModel, Sequenced
 
 
 class SequenceInput(NamedTuple):
