@@ -296,7 +296,7 @@ def _clock(seconds: float) -> str:
 IN_A_ROW = 3  # ours: iterations; one bad value is an accident, and the next rollout is another
 
 
-class Health:
+class FiniteCheck:
     """What the last iterations were like."""
 
     def __init__(self, names: Sequence[str], stored: Sequence[str]) -> None:

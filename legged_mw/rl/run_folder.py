@@ -165,7 +165,7 @@ class RunLock:
         return os.fstat(self._file.fileno()).st_nlink == 0
 
 
-class Keeper:
+class CheckpointWriter:
     """Writes what a training needs to go on, as often as asked; what cannot be written is said, and the training goes on in memory."""
 
     def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:

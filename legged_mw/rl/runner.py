@@ -34,7 +34,7 @@ from legged_mw.rl.checkpoint import (
 from legged_mw.rl.iteration_log import (
     Clock,
     Console,
-    Health,
+    FiniteCheck,
     Mark,
     Message,
     Report,
@@ -44,10 +44,10 @@ from legged_mw.rl.iteration_log import (
 )
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.policies import acting
-from legged_mw.rl.ppo import GraphedPPO, RegressingModel, Undo
+from legged_mw.rl.ppo import GraphedPPO, RegressingModel, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
 from legged_mw.rl.rsl_rl_settings import rsl_rl_config
-from legged_mw.rl.run_folder import Keeper, reason_of
+from legged_mw.rl.run_folder import CheckpointWriter, reason_of
 from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
@@ -58,7 +58,7 @@ class Runner(OnPolicyRunner):
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
     resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a checkpoint;
-    ``diverged`` says why the runner set it by itself, ``begins_anew`` why ``load`` did not find the worlds of a checkpoint. Set
+    ``diverged`` says why the runner set it by itself, ``why_not_exact`` why ``load`` did not find the worlds of a checkpoint. Set
     ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
     """
 
@@ -72,15 +72,16 @@ class Runner(OnPolicyRunner):
         self.total_steps = 0
         self.stop: str | None = None
         self.deadline: float | None = None  # the time at which `learn` shall be done, and all annealed [s]
-        self.plan = Plan()
+        self.schedule = TrainingSchedule()
         self.diverged = ""  # why training had to end, in words
-        self.begins_anew = "it is a new run"
-        self.keeper: Keeper | None = None  # writes checkpoints; made in `learn` where there is a folder
+        self.why_not_exact = "it is a new run"
+        self.writer: CheckpointWriter | None = None  # writes checkpoints; made in `learn` where there is a folder
         self._watch = DivergenceStop()
         recorded = getattr(self.alg, "graphed", False)
-        self._undo: Undo = self.alg.undo if recorded else Undo(self.alg, self._networks().values())  # type: ignore[union-attr]
+        learner: Any = self.alg
+        self._rollback = learner.rollback if recorded else UpdateRollback(learner, self._networks().values())
         self._settles = not recorded  # the recorded update undoes itself
-        self._health = Health([name for each in env.nonfinite for name in each.names], self._stored_names())
+        self._finite_check = FiniteCheck([name for each in env.nonfinite for name in each.names], self._stored_names())
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self.update_threads = (
@@ -116,18 +117,18 @@ class Runner(OnPolicyRunner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        if self.logger.log_dir and not self.keeper:
-            self.keeper = Keeper(Path(self.logger.log_dir), self.cfg["keep_checkpoints"], this_rank())
+        if self.logger.log_dir and not self.writer:
+            self.writer = CheckpointWriter(Path(self.logger.log_dir), self.cfg["keep_checkpoints"], this_rank())
         self._open_curves()
         self.env.take_statistics()
         clock, waiting = Clock(self.device), None
-        self._make_plan(self.current_learning_iteration + num_learning_iterations)
+        self._make_schedule(self.current_learning_iteration + num_learning_iterations)
         self._all_stop = False
         start = clock.mark()
-        while self.current_learning_iteration < self.plan.last and not self._must_stop():
+        while self.current_learning_iteration < self.schedule.last and not self._must_stop():
             self._anneal()  # first, so that a resumed rollout is what it would have been
             if self._settles:
-                self._undo.remember()
+                self._rollback.begin()
             obs = self._rollout(obs)
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
@@ -142,7 +143,7 @@ class Runner(OnPolicyRunner):
                 self.env.domain_rand.redraw()
             if (
                 self.current_learning_iteration % self.cfg["save_interval"] == 0
-                and self.current_learning_iteration < self.plan.last
+                and self.current_learning_iteration < self.schedule.last
             ):
                 self._save_checkpoint()
             # what waits to be logged still does: ranks must hear of a stop in the same iteration
@@ -156,16 +157,16 @@ class Runner(OnPolicyRunner):
             self._examine()
         self._end_curves()
 
-    def _make_plan(self, last: int) -> None:
+    def _make_schedule(self, last: int) -> None:
         """Until the iteration ``last`` or the deadline. Ranks go by the first one's clock."""
-        self.plan = Plan(last, self.deadline, self.plan.seconds)
-        self.plan.done, self.console.deadline = first_ranks(self.plan.done, self.device), self.deadline
+        self.schedule = TrainingSchedule(last, self.deadline, self.schedule.seconds)
+        self.schedule.done, self.console.deadline = first_ranks(self.schedule.done, self.device), self.deadline
 
     def _anneal(self) -> None:
         """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
             self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
-        done = self.plan.begin(self.current_learning_iteration)
+        done = self.schedule.begin(self.current_learning_iteration)
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
@@ -193,24 +194,24 @@ class Runner(OnPolicyRunner):
             try:
                 losses = self.alg.update()
             except (RuntimeError, ValueError):  # rsl-rl's own draws from distributions that are not finite
-                self._undo.settle()
-                if not self._undo.undone:
+                self._rollback.finish()
+                if not self._rollback.undone:
                     raise
                 self.alg.storage.clear()
                 return {}
-            self._undo.settle()
+            self._rollback.finish()
             return losses
 
     def _exam_is_due(self) -> bool:
         """Every ``exam_interval`` iterations; the last iteration's exam waits until the last checkpoint is written."""
         interval, done = self.cfg["exam_interval"], self.current_learning_iteration
-        return self.examine is not None and interval > 0 and done % interval == 0 and done < self.plan.last
+        return self.examine is not None and interval > 0 and done % interval == 0 and done < self.schedule.last
 
     def _next_exam(self, done: int) -> int | None:
         """The iteration after which the next exam comes, if any does."""
         interval = self.cfg["exam_interval"]
         return (
-            min((done // interval + 1) * interval, self.plan.last)
+            min((done // interval + 1) * interval, self.schedule.last)
             if self.examine is not None and interval > 0
             else None
         )
@@ -234,7 +235,7 @@ class Runner(OnPolicyRunner):
         self.last_exam = self.current_learning_iteration, figures
         found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
         self._draw_curves(found, self.current_learning_iteration)
-        self.console.exam(self.current_learning_iteration, self.plan.last, figures)
+        self.console.exam(self.current_learning_iteration, self.schedule.last, figures)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
@@ -243,7 +244,7 @@ class Runner(OnPolicyRunner):
         self.current_learning_iteration += 1
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
-        asks = float(self.stop is not None), self.plan.room() if self.gpu_global_rank == 0 else 0.0
+        asks = float(self.stop is not None), self.schedule.iterations_left() if self.gpu_global_rank == 0 else 0.0
         taken = (
             [each.take() for each in self.env.nonfinite],
             [torch.full((1,), value, device=self.device) for value in asks],
@@ -258,9 +259,10 @@ class Runner(OnPolicyRunner):
             if isinstance(self.alg, GraphedPPO)
             else torch.full((), self.alg.learning_rate, device=self.device)
         )
-        own += [rate.to(self.device, torch.float), self._action_std(), self._undo.undone]
+        own += [rate.to(self.device, torch.float), self._action_std(), self._rollback.undone]
         message = Message(
-            torch.cat([summed, torch.stack(own), self._undo.wrong]), [*sizes, len(losses), 2, 1, len(self._undo.wrong)]
+            torch.cat([summed, torch.stack(own), self._rollback.wrong]),
+            [*sizes, len(losses), 2, 1, len(self._rollback.wrong)],
         )
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
@@ -276,7 +278,7 @@ class Runner(OnPolicyRunner):
         statistics, nonfinite, (stop, room), lost, settings, (undone,), wrong = report.message.read()
         numbers = self.env.name_statistics(statistics)
         self._all_stop = stop > 0
-        self.plan.hear(report.iteration, room)
+        self.schedule.end_after(report.iteration, room)
         if verdict := self._watch.verdict(numbers):
             self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
         losses = dict(zip(report.losses, lost, strict=True))
@@ -287,15 +289,15 @@ class Runner(OnPolicyRunner):
         speed = report.steps / (collect + learn)
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
         self.console.iteration(
-            report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed
+            report.iteration, self.schedule.last, self._next_exam(report.iteration), numbers, rows, speed
         )
-        warnings, verdict = self._health.judge(nonfinite, report.steps, undone > 0, wrong)
-        warnings += self._health.lengths(numbers)
+        warnings, verdict = self._finite_check.judge(nonfinite, report.steps, undone > 0, wrong)
+        warnings += self._finite_check.lengths(numbers)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:
             self.diverged, self.stop = self.diverged or verdict, self.stop or "learning has died"
         drawn = curves(numbers, losses, speed, collect, learn, report.total_steps)
-        self._draw_curves({**drawn, "Train/undone_updates": float(self._health.undone)}, report.iteration)
+        self._draw_curves({**drawn, "Train/undone_updates": float(self._finite_check.undone)}, report.iteration)
         if numbers["overflowed"] and not self._warned_overflow:
             others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise nconmax and njmax"
             print(f"WARNING: {self.env.sim.overflow_report() or others}", flush=True)
@@ -305,7 +307,7 @@ class Runner(OnPolicyRunner):
         """What the columns are that an update learns from, in words: of each observation group, then the rewards'."""
         table, names = self.env.observations, []
         rows = {group: [row.name for row in table.rows(group) for _ in range(row.size)] for group in table.groups}
-        for group, i in self._undo.columns:
+        for group, i in self._rollback.columns:
             names.append(
                 f"observation row '{rows[group][i]}' of '{group}'" if group in rows else f"observation group '{group}'"
             )
@@ -358,11 +360,11 @@ class Runner(OnPolicyRunner):
                 flush=True,
             )
             return
-        if not self.keeper:
+        if not self.writer:
             return
-        if self.keeper.write(self.current_learning_iteration, self._content, partial(worlds_content, self)):
-            self.logger.save_model(str(self.keeper.written), self.current_learning_iteration)
-        if self._curves_lost or self.keeper.moved:
+        if self.writer.write(self.current_learning_iteration, self._content, partial(worlds_content, self)):
+            self.logger.save_model(str(self.writer.written), self.current_learning_iteration)
+        if self._curves_lost or self.writer.moved:
             self._curves_lost = False
             self._open_curves()
 
@@ -378,7 +380,7 @@ class Runner(OnPolicyRunner):
             **(infos or {}),
             "total_steps": self.total_steps,
             "random_state": random_state(self.device),
-            **self.plan.saved(),
+            **self.schedule.saved(),
         }
         return content | {"iter": self.current_learning_iteration, "infos": {**told, "env": self.env.training_state()}}
 
@@ -404,15 +406,17 @@ class Runner(OnPolicyRunner):
                 if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
                     group["lr"] = self.alg.learning_rate
         infos = content.get("infos") or {}
-        self.total_steps, self.plan = infos.get("total_steps", 0), Plan(used=infos.get("seconds", 0.0))
+        self.total_steps, self.schedule = infos.get("total_steps", 0), TrainingSchedule(used=infos.get("seconds", 0.0))
         self.env.load_training_state(infos.get("env", {}))  # before the random state: it begins episodes
         random = infos.get("random_state", {})
-        self.begins_anew = first_word(take_worlds(self, Path(path), this_rank(), random))
-        if self.begins_anew and self.env.cfg.domain_rand.redraw_iterations:  # the first ones, of the seed, it has left
+        self.why_not_exact = first_word(take_worlds(self, Path(path), this_rank(), random))
+        if (
+            self.why_not_exact and self.env.cfg.domain_rand.redraw_iterations
+        ):  # the first ones, of the seed, it has left
             self.env.domain_rand.redraw()
         if self.gpu_global_rank == 0:
             set_random_state(random, self.device)
-        elif self.begins_anew:  # the file holds the first rank's; the others must not draw the same
+        elif self.why_not_exact:  # the file holds the first rank's; the others must not draw the same
             torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
 
@@ -458,7 +462,7 @@ def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
 _WINDOW = 50  # iterations whose median duration says how many more the time has room for
 
 
-class Plan:
+class TrainingSchedule:
     """What a training was asked for, and how much of it is ``done``: 0 in its first iteration, 1 in its last, never less than before.
 
     With a ``deadline`` the number of the last iteration is not known at first: it is estimated anew after each iteration, and ``done``
@@ -491,7 +495,7 @@ class Plan:
         self._first, self.done = False, min(share, 1.0)
         return self.done
 
-    def room(self) -> float:
+    def iterations_left(self) -> float:
         """An iteration has ended: how many more there is time for, by the median of the last ones; inf until one can say."""
         now = time.time()
         self._times.append(now - self._before)
@@ -501,7 +505,7 @@ class Plan:
         pace = median(self._times if len(self._times) in (1, _WINDOW) else list(self._times)[1:])
         return float(max(0, round((self.deadline - now) / max(pace, 1e-9))))
 
-    def hear(self, iteration: int, room: float) -> None:
+    def end_after(self, iteration: int, room: float) -> None:
         """After ``iteration`` there was time for ``room`` more."""
         self.last = int(min(self._wanted, iteration + room))
 

@@ -28,7 +28,7 @@ from legged_mw.rl.rsl_rl_settings import check_classes, check_room
 from legged_mw.rl.run_folder import (
     CONFIG_FILE,
     LOCK_FILE,
-    Keeper,
+    CheckpointWriter,
     RunLock,
     experiment_folder,
     find_checkpoint,
@@ -263,12 +263,12 @@ def train(
 
 def _not_saved(runner: Runner) -> str:
     """That the last checkpoint could not be written; ''."""
-    keeper, done = runner.keeper, runner.current_learning_iteration
-    if not (keeper and keeper.failed):
+    writer, done = runner.writer, runner.current_learning_iteration
+    if not (writer and writer.failed):
         return ""
-    kept = keeper.written
+    kept = writer.written
     newest = f"the newest that is written is {shown(kept)}" if kept else "none of this training is written"
-    return f"the last checkpoint, of iteration {done}, cannot be written to {shown(keeper.folder)}: {keeper.failed}; {newest}"
+    return f"the last checkpoint, of iteration {done}, cannot be written to {shown(writer.folder)}: {writer.failed}; {newest}"
 
 
 def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
@@ -281,8 +281,8 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
         raise ConfigError(f"{what} has done {done} iterations of {wanted}; raise --max_iterations to go on")
     if start.checkpoint:
         print(f"resuming {shown(start.checkpoint)}")
-        anew = f"worlds begin anew ({runner.begins_anew}); networks, counters and curricula go on"
-        print(anew if runner.begins_anew else "exactly: worlds and generators go on where they were", flush=True)
+        anew = f"worlds begin anew ({runner.why_not_exact}); networks, counters and curricula go on"
+        print(anew if runner.why_not_exact else "exactly: worlds and generators go on where they were", flush=True)
     return wanted - done
 
 
@@ -352,7 +352,7 @@ def _open_run(
         runner.logger.log_dir = str(folder[0])
         print(f"writing to {shown(folder[0])}", flush=True)
     folder[0] = first_ranks(folder[0], runner.device)
-    runner.keeper = Keeper(folder[0], task.train.runner.keep_checkpoints, rank, restore)
+    runner.writer = CheckpointWriter(folder[0], task.train.runner.keep_checkpoints, rank, restore)
     return folder[0]
 
 
@@ -361,7 +361,7 @@ def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     settle()
     try:
         with runner.console:
-            runner.learn(iterations, bool(runner.begins_anew))
+            runner.learn(iterations, bool(runner.why_not_exact))
         if isinstance(runner.alg, Recorded):
             runner.alg.release()
     except RuntimeError as error:
@@ -381,9 +381,9 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
         print(
             f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}"
         )
-    flags, plan, done = _flags(task, folder), runner.plan, runner.current_learning_iteration
-    if runner.stop and done < plan.last:
-        left = f" --max_time {max(1, round(plan.deadline - time.time()))}s" if plan.deadline else ""
+    flags, schedule, done = _flags(task, folder), runner.schedule, runner.current_learning_iteration
+    if runner.stop and done < schedule.last:
+        left = f" --max_time {max(1, round(schedule.deadline - time.time()))}s" if schedule.deadline else ""
         print(
             f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}{left}", flush=True
         )

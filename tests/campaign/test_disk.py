@@ -23,7 +23,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged_mw import ROOT
 from legged_mw.rl import checkpoint, training
 from legged_mw.rl.ranks import Rank
-from legged_mw.rl.run_folder import LOCK_FILE, Keeper, RunLock, checkpoints
+from legged_mw.rl.run_folder import LOCK_FILE, CheckpointWriter, RunLock, checkpoints
 from legged_mw.rl.runner import Runner
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.console import SafeStream
@@ -115,7 +115,7 @@ def test_a_full_disk_keeps_the_newest_that_could_be_written(tmp_path: Path, monk
 
 
 def test_a_folder_that_is_deleted_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before_iteration(monkeypatch, lambda self, i: i == 3 and shutil.rmtree(self.keeper.folder))  # type: ignore[union-attr]
+    before_iteration(monkeypatch, lambda self, i: i == 3 and shutil.rmtree(self.writer.folder))  # type: ignore[union-attr]
     result = train(tmp_path, 4)
     folder = only_run(tmp_path)
     assert result.code == 0 and sound(folder) == [3, 4] and (folder / "config.yaml").is_file()
@@ -218,10 +218,10 @@ def test_old_checkpoints_are_thinned(tmp_path: Path) -> None:
 
 def test_worlds_of_a_rank_stay_until_the_first_one_has_written_the_checkpoint(tmp_path: Path) -> None:
     """Else a kill in between would leave the newest checkpoint without them."""
-    follower, first = (Keeper(tmp_path, 0, Rank(index, index, 2)) for index in (1, 0))
+    follower, first = (CheckpointWriter(tmp_path, 0, Rank(index, index, 2)) for index in (1, 0))
 
-    def write(keeper: Keeper, iteration: int) -> set[str]:
-        assert keeper.write(iteration, dict, dict)
+    def write(writer: CheckpointWriter, iteration: int) -> set[str]:
+        assert writer.write(iteration, dict, dict)
         return {path.name for path in tmp_path.glob("worlds_*.pt")}
 
     assert write(first, 1) | write(follower, 1) == {"worlds_1_0of2.pt", "worlds_1_1of2.pt"}
@@ -234,13 +234,13 @@ def test_worlds_of_another_number_of_processes_go(tmp_path: Path) -> None:
     """Once a checkpoint after them is whole, which the first process alone knows."""
     for name in ("worlds_1.pt", "worlds_2_0of3.pt", "worlds_2_11of12.pt", "worlds_9_0of3.pt", "worlds_of_mine.pt"):
         (tmp_path / name).touch()
-    follower, first, alone = (Keeper(tmp_path, 0, Rank(*rank)) for rank in ((1, 1, 2), (0, 0, 2), (0, 0, 1)))
-    for keeper, iteration, stay in (
+    follower, first, alone = (CheckpointWriter(tmp_path, 0, Rank(*rank)) for rank in ((1, 1, 2), (0, 0, 2), (0, 0, 1)))
+    for writer, iteration, stay in (
         (follower, 3, {"worlds_1.pt", "worlds_2_0of3.pt", "worlds_2_11of12.pt", "worlds_3_1of2.pt"}),
         (first, 3, {"worlds_3_0of2.pt", "worlds_3_1of2.pt"}),
         (alone, 4, {"worlds_4.pt"}),
     ):
-        assert keeper.write(iteration, dict, dict)
+        assert writer.write(iteration, dict, dict)
         assert {path.name for path in tmp_path.glob("worlds_*")} == {*stay, "worlds_9_0of3.pt", "worlds_of_mine.pt"}
 
 
@@ -296,7 +296,7 @@ def test_a_resume_whose_checkpoint_is_not_the_newest_any_more_is_refused(
     def never(*_: object) -> bool:
         raise AssertionError
 
-    monkeypatch.setattr(Keeper, "write", never)
+    monkeypatch.setattr(CheckpointWriter, "write", never)
     build = training.build
 
     def slow_build(*args: Any) -> Any:

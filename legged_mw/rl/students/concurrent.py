@@ -60,10 +60,10 @@ class ConcurrentModel(RegressingModel):
                 EmpiricalNormalization(known) if self.obs_normalization else nn.Identity(), MLP(known, *encoder)
             )
             self.register_buffer(
-                "taught", taught_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False
+                "teacher_worlds", pick_teacher_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False
             )
 
-    taught: Tensor  # (N, 1): the worlds that act by the teacher's latent
+    teacher_worlds: Tensor  # (N, 1): the worlds that act by the teacher's latent
 
     def _get_latent_dim(self) -> int:
         return sum(stop - start for start, stop in self._newest) + self._size
@@ -75,19 +75,19 @@ class ConcurrentModel(RegressingModel):
             return join(seen, self._newest, self.estimator(seen))
 
     def rollout_latent(self, obs: TensorDict) -> Tensor:
-        return self._take_over(self.get_latent(obs), self.teacher(self._known(obs)), self.taught)
+        return self._take_over(self.get_latent(obs), self.teacher(self._known(obs)), self.teacher_worlds)
 
     @torch.no_grad()
-    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """What the two encoders read (B, ...), with columns of zeros up to a multiple of four, and who is taught (B, 1)."""
+    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """What the two encoders read (B, ...), with columns of zeros up to a multiple of four, and who is by_teacher (B, 1)."""
         seen, known = MLPModel.get_latent(self, obs), self.teacher[0](self._known(obs))
-        taught = self.taught.index_select(0, worlds).repeat(len(seen) // len(worlds), 1)
-        return *(nn.functional.pad(each, (0, -each.shape[1] % 4)) for each in (seen, known)), taught
+        by_teacher = self.teacher_worlds.index_select(0, worlds).repeat(len(seen) // len(worlds), 1)
+        return *(nn.functional.pad(each, (0, -each.shape[1] % 4)) for each in (seen, known)), by_teacher
 
-    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        seen, known, taught = lesson
+    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        seen, known, by_teacher = regression_batch
         wanted = run_mlp(self.teacher[1], known)
-        output = run_mlp(self.mlp, self._take_over(latent, wanted, taught))
+        output = run_mlp(self.mlp, self._take_over(latent, wanted, by_teacher))
         return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
@@ -97,11 +97,13 @@ class ConcurrentModel(RegressingModel):
     def _known(self, obs: TensorDict) -> Tensor:
         return torch.cat([obs[group] for group in self._groups], dim=-1)
 
-    def _take_over(self, own: Tensor, encoded: Tensor, taught: Tensor) -> Tensor:
-        """What the network reads (B, ...), with the teacher's latent where ``taught`` (B, 1)."""
+    def _take_over(self, own: Tensor, encoded: Tensor, by_teacher: Tensor) -> Tensor:
+        """What the network reads (B, ...), with the teacher's latent where ``by_teacher`` (B, 1)."""
         stop = self._get_latent_dim()
         start = stop - self._size
-        return torch.cat([own[:, :start], torch.where(taught, unit(encoded), own[:, start:stop]), own[:, stop:]], dim=1)
+        return torch.cat(
+            [own[:, :start], torch.where(by_teacher, unit(encoded), own[:, start:stop]), own[:, stop:]], dim=1
+        )
 
     def as_onnx(self, verbose: bool) -> nn.Module:
         return _OnnxStudent(self)
@@ -138,7 +140,7 @@ def unit(x: Tensor) -> Tensor:
     return nn.functional.normalize(x, dim=-1)
 
 
-def taught_worlds(worlds: int, share: float) -> Tensor:
+def pick_teacher_worlds(worlds: int, share: float) -> Tensor:
     """Which of N worlds act by the teacher's latent, (N, 1): always the same, and among neighbours some of both."""
     return ((torch.arange(worlds, dtype=torch.float64) * _GOLDEN) % 1.0 < share)[:, None]
 

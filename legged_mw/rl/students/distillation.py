@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
-from legged_mw.rl.ppo import Memories, Recorded, Undo, why_stock
+from legged_mw.rl.ppo import Memories, Recorded, UpdateRollback, why_stock
 from legged_mw.rl.students.recurrent import step
 from legged_mw.sim.graph import StepGraph
 
@@ -45,7 +45,7 @@ class GraphedDistillation(Recorded, Distillation):
         # what the teacher sees is not learned from
         storage.observations = storage.observations.select(*student.obs_groups)
         self._loss = torch.zeros((), device=self.device)
-        self.undo = Undo(self, (self.student,))
+        self.rollback = UpdateRollback(self, (self.student,))
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -99,7 +99,7 @@ class GraphedDistillation(Recorded, Distillation):
         return {"behavior": self._loss.clone()}
 
     def _update(self) -> None:
-        self.undo.remember()
+        self.rollback.begin()
         st, memory = self.storage, self._memories.get(self.student)
         with torch.no_grad():
             seen = torch.cat([st.observations[group] for group in self.student.obs_groups], dim=-1).flatten(0, 1)
@@ -123,7 +123,7 @@ class GraphedDistillation(Recorded, Distillation):
         if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
             with torch.no_grad():
                 update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
-        self.undo.settle(self._loss)
+        self.rollback.finish(self._loss)
 
     def _unroll(self, inputs: Tensor, ended: Tensor, state: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """What the student's MLP reads (S * N, size) of S steps (S, N, size), and its hidden state after them, detached.

@@ -83,13 +83,13 @@ class EstimatingModel(RegressingModel):
         return torch.cat([seen, estimate], dim=-1)
 
     @torch.no_grad()
-    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
         """The targets (B, E), normalised: what the estimator is to say."""
         return (self.target_normalizer(self.truth(obs)),)
 
-    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """The estimator reads the first columns of the latent, the observations."""
-        return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), lesson[0])
+        return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), regression_batch[0])
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         update_normalizer(self.target_normalizer, self.truth(obs), ranks)
