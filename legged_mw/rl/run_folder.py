@@ -1,4 +1,4 @@
-"""A run's folder while it trains: who may write there, checkpoints that are written as long as it can be, old ones that go."""
+"""Run folders: making and finding them, the lock of a training, and the checkpoints that it writes and prunes there."""
 
 from __future__ import annotations
 
@@ -7,26 +7,24 @@ import os
 import re
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
-from legged_mw.utils.config import ConfigError, load_yaml
-from legged_mw.utils.errors import shown, unknown
-from legged_mw.utils.files import check_folder, check_name, typed
-from legged_mw.utils.task import LoadedTask, of_project, somebodys
-
 try:
     import fcntl
-except ImportError:  # not on Windows: nothing is locked there
+except ImportError:  # Windows: no locks
     fcntl = None
 
 from legged_mw.rl.checkpoint import save_whole, suffix_of, worlds_file
 from legged_mw.rl.ranks import Rank
-from legged_mw.utils.files import sweep
+from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.errors import shown, unknown
+from legged_mw.utils.files import check_folder, check_name, sweep, typed
+from legged_mw.utils.task import LoadedTask, of_project, somebodys
 
 CONFIG_FILE = "config.yaml"
+LOCK_FILE = ".lock"
 
 
 def logs_folder() -> Path:
@@ -35,7 +33,7 @@ def logs_folder() -> Path:
 
 
 def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
-    """The folder of a task's runs, or of the experiment called ``name``. Raises UserError for a name that is none."""
+    """The folder of a task's runs, or of the experiment called ``name``. Raises UserError for a name that is not allowed."""
     return logs_folder() / check_name(
         name or task.train.runner.experiment_name or task.name, "the name of the experiment"
     )
@@ -55,11 +53,11 @@ def new_run(experiment: Path, run_name: str) -> Path:
 
 
 def runs(experiment: Path) -> list[Path]:
-    """Run folders that hold a checkpoint, oldest first by the time of their newest checkpoint. What cannot be read is none."""
+    """Readable run folders with a checkpoint, oldest first by the time of their newest checkpoint."""
     found: dict[Path, int] = {}
     for folder in experiment.glob("*"):
-        # a link to itself, a folder of another user's, a checkpoint that is thinned out as it is looked at
-        with suppress(OSError):
+        # a link to itself, a folder of another user, a checkpoint that is pruned at this moment
+        with contextlib.suppress(OSError):
             if there := checkpoints(folder):
                 found[folder] = max(path.stat().st_mtime_ns for path in there.values())
     return sorted(found, key=lambda folder: found[folder])
@@ -72,7 +70,7 @@ def checkpoints(run: Path) -> dict[int, Path]:
 
 
 def find_run(experiment: Path, name: str) -> Path:
-    """The run called ``name`` below ``experiment``, a path to one, or for "-1" the one last trained. It may be a stranger's."""
+    """The run called ``name`` below ``experiment``, a path to one (maybe a stranger's), or for "-1" the run last trained."""
     found, given = runs(experiment), typed(name)
     if name == "-1":
         if not found:
@@ -99,9 +97,9 @@ def find_checkpoint(run: Path, iteration: int) -> Path:
 
 
 def task_of(run: Path, named: LoadedTask | None = None) -> str:
-    """What ``--task`` is for the run in the folder ``run``: the project's task that its config names, or a file that ``named`` has run.
+    """The ``--task`` of the run in the folder ``run``: a task of the project, or a file that the task ``named`` is or extends.
 
-    No other file, since a file is code, and a run may be a stranger's. Raises ConfigError with what to type.
+    No other file: a file is code, and the run may be a stranger's. Raises ConfigError that says what to type.
     """
     stored = load_yaml(run / CONFIG_FILE).get("task", "")
     if not isinstance(stored, str) or not stored:
@@ -114,29 +112,26 @@ def task_of(run: Path, named: LoadedTask | None = None) -> str:
 
 
 def task_at(path: str) -> str:
-    """``task_of`` the run that the user named by its path; "" if there is no run."""
+    """``task_of`` the run at the path that the user typed, or '' if there is no run."""
     run = typed(path)
     return task_of(check_folder(run)) if (run / CONFIG_FILE).is_file() else ""
 
 
-LOCK_FILE = ".lock"
-
-
 class RunLock:
-    """That this process trains in a folder. It ends with the process, however that ends."""
+    """The lock of the process that trains in a folder. The system releases it however the process ends."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises ConfigError if another process has it, OSError if nothing can be written there."""
+        """Raises ConfigError if another process has the lock, OSError if the folder cannot be written."""
         self._folder, self._file = folder, open(folder / LOCK_FILE, "a+")  # noqa: SIM115 (open until it is released)
         try:
             if fcntl:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._file.seek(0)
-            who = self._file.read().strip() or "another process"
+            owner = self._file.read().strip() or "another process"
             self._file.close()
             raise ConfigError(
-                f"{shown(folder)} is being trained by {who}; wait for its end, stop it, or name another run"
+                f"{shown(folder)} is being trained by {owner}; wait for its end, stop it, or name another run"
             ) from None
         except OSError as error:  # a file system without locks
             print(
@@ -145,7 +140,7 @@ class RunLock:
             )
 
     def begin(self) -> None:
-        """Say who it is, and sweep what a process that was killed left half written."""
+        """Write the owner into the lock, and delete half-written files of a killed process."""
         self._file.truncate(0)
         self._file.write(f"process {os.getpid()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
         self._file.flush()
@@ -161,31 +156,31 @@ class RunLock:
         self._file.close()
 
     def lost(self) -> bool:
-        """Whether the folder with the lock is gone."""
+        """Whether somebody has deleted the folder and the lock in it."""
         return os.fstat(self._file.fileno()).st_nlink == 0
 
 
 class CheckpointWriter:
-    """Writes what a training needs to go on, as often as asked; what cannot be written is said, and the training goes on in memory."""
+    """Writes checkpoints of a training and prunes old ones. If one cannot be written, it warns and the training goes on."""
 
     def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:
-        """``keep`` newest checkpoints; 0: all. ``prepare`` makes the folder and what else belongs there, if it is gone, and says so."""
+        """``keep``: how many newest checkpoints stay, 0 for all. ``prepare``: make the folder if it is gone; returns whether it was."""
         self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
-        self.failed = ""  # why the newest checkpoint could not be written, '' if it could
-        self.written: Path | None = None  # the newest one that could
-        self.moved = False  # the folder had to be made again
+        self.failed = ""  # why the newest checkpoint could not be written, or ''
+        self.written: Path | None = None  # the newest one that was written
+        self.moved = False  # the folder was made again
 
     def write(
         self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]
     ) -> bool:
-        """Worlds, then the checkpoint, then sweep the ones before; returns whether the checkpoint is there."""
+        """Write worlds, then the checkpoint, then prune; returns whether the checkpoint is written."""
         path = self.folder / f"model_{iteration}.pt"
         try:
             self.moved = self._prepare()
             self._write_worlds(worlds, worlds_file(path, self._rank), path)
             if self._rank.leads:
                 save_whole(checkpoint(), path)
-        except (OSError, MemoryError) as error:  # the file is put together in memory
+        except (OSError, MemoryError) as error:  # the file is composed in memory
             self.failed = reason_of(error)
             newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
             print(
@@ -194,29 +189,28 @@ class CheckpointWriter:
             )
             if not path.exists():
                 with contextlib.suppress(OSError):
-                    # of use to no checkpoint, and the disk is full
-                    worlds_file(path, self._rank).unlink(missing_ok=True)
+                    worlds_file(path, self._rank).unlink(missing_ok=True)  # useless, and the disk is full
             return False
         self.failed, self.written = "", path
         with contextlib.suppress(OSError):
-            self._sweep()
+            self._prune()
         return True
 
     def _write_worlds(self, worlds: Callable[[], dict[str, Any]], file: Path, checkpoint: Path) -> None:
-        """They are many times as large as the checkpoint, which may have room without them."""
+        """Write the file of worlds if there is room. It is many times as large as the checkpoint, which may fit without it."""
         try:
-            save_whole(worlds(), file, sync=False)  # one that a power cut tears is found out by its reader
+            save_whole(worlds(), file, sync=False)  # its reader detects a file torn by a power cut
         except (OSError, MemoryError) as error:
             print(
                 f"WARNING: {file.name} cannot be written: {reason_of(error)}; from {checkpoint.name} worlds begin anew",
                 flush=True,
             )
 
-    def _sweep(self) -> None:
-        """Worlds of checkpoints before the newest, and the checkpoints that are too many.
+    def _prune(self) -> None:
+        """Delete worlds of checkpoints before the newest, and the oldest checkpoints.
 
-        Another rank than the first may come here before the newest is written: then the worlds of the one before stay. The first
-        sweeps those of another number of processes, too, which trained here before.
+        A rank that comes here before the first one has written the newest checkpoint leaves the worlds of the one before.
+        The first rank also deletes worlds of an earlier training with another number of processes.
         """
         there = checkpoints(self.folder)
         newest, rank = max(there, default=0), self._rank
@@ -231,7 +225,7 @@ class CheckpointWriter:
 
 
 def reason_of(error: BaseException) -> str:
-    """Why a file could not be written, in words: the system's, if it is behind a library's."""
+    """Why a file could not be written: the system's reason, if a library's error hides one."""
     first: BaseException | None = error
     while first is not None and not isinstance(first, OSError):
         first = first.__cause__ or first.__context__
