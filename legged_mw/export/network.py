@@ -21,8 +21,8 @@ INPUT, OUTPUT = "obs", "actions"
 class ExportedPolicy(nn.Module):
     """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside.
 
-    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of one that
-    estimates, the estimate (N, E) comes out beside them.
+    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of
+    one that estimates, the estimate (N, E) comes out beside them.
     """
 
     policy: Any

@@ -79,8 +79,8 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
 def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
     """What the environment's robots would measure now.
 
-    Deploy's own scene measures positions and velocities, in the state of the environment. What needs forces or contacts comes
-    from the environment, whose sensors are one physics step old and zero after a reset.
+    Deploy's own scene measures positions and velocities, in the state of the environment. What needs forces or contacts
+    comes from the environment, whose sensors are one physics step old and zero after a reset.
     """
     fleet.qpos[:], fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
     fleet.refresh()

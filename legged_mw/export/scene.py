@@ -1,6 +1,7 @@
 """A robot with its ground, servos and named sensors as one MJCF text that needs no other file. Host only; nothing is stepped.
 
-Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is checked.
+Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is
+checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -69,8 +70,8 @@ def standalone(
 ) -> Scene:
     """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
-    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be written out.
-    Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
+    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be
+    written out. Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
     spec = with_scene(robot, camera)
     if files := [field.name for field in spec.hfields if field.file]:
@@ -101,8 +102,8 @@ def standalone(
 def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     """The scene of ``standalone`` on the level pieces of ``terrain``, as boxes; the robot starts at ``start``, x, y, z [m].
 
-    Level ground surrounds them for ``AROUND``. Raises ModelError for slopes and noise, which are no level pieces, and for too
-    many pieces: as text, a height field would have some megabytes.
+    Level ground surrounds them for ``AROUND``. Raises ModelError for slopes and noise, which are no level pieces, and
+    for too many pieces: as text, a height field would have some megabytes.
     """
     spec = mujoco.MjSpec.from_string(xml)
     floor, (boxes, _, left) = spec.geom(GROUND), as_boxes(terrain)
@@ -211,7 +212,7 @@ def _close(a: object, b: object) -> bool:
     return a.shape == b.shape and bool(np.all(np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(a))))
 
 
-# ---- meshes that MuJoCo builds from some numbers, written as those numbers: as text, their vertices are most of an MJCF -
+# ---- meshes that MuJoCo builds from some numbers, written as those numbers: as text, their vertices are most of an MJ
 
 _BUILT = ("vertex", "normal", "texcoord", "face", "facenormal", "facetexcoord")  # what the numbers stand for
 _PLACES = ("mesh_vertnum", "mesh_facenum", "mesh_vert", "mesh_pos", "mesh_quat", "geom_pos", "geom_quat", "geom_size")
@@ -221,7 +222,8 @@ PLACE_TOLERANCE = 1e-5  # of places [m] and of quaternions: MuJoCo writes six di
 def shorten(xml: str, source: str) -> str:
     """``xml``, an MJCF that MuJoCo wrote, with meshes as ``source``, an MJCF that somebody wrote, has MuJoCo build them.
 
-    As it was, where that would be another model: a mesh may have been renamed, or come from a file that ``source`` includes.
+    As it was, where that would be another model: a mesh may have been renamed, or come from a file that ``source``
+    includes.
     """
     short = xml
     for name, numbers in built_meshes(source).items():

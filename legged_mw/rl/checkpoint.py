@@ -1,7 +1,7 @@
 """The files of a checkpoint: written whole, and read without running code or trusting a number in them.
 
-``model_N.pt`` holds networks, optimizer and counters. ``worlds_N.pt`` beside the newest one holds worlds, generators and
-memories, with which a resumed training goes on exactly.
+``model_N.pt`` holds networks, optimizer and counters. ``worlds_N.pt`` beside the newest one holds worlds, generators
+and memories, with which a resumed training goes on exactly.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ EARLIER = "an earlier one is named by --checkpoint"
 
 
 def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
-    """Write a checkpoint and its checksum. A kill at any moment (``sync``: a power cut too) leaves the whole file or none."""
+    """Write a checkpoint with its checksum: whole, or not at all after a kill (``sync``: or a power cut)."""
     temporary, archive = path.with_name(f".{path.name}.{os.getpid()}.tmp"), io.BytesIO()
     torch.save(content, archive)
     try:
@@ -86,7 +86,7 @@ def damage(content: bytes) -> str:
         return f"it is damaged: {error}"
 
 
-# ---- what a checkpoint may hold ----------------------------------------------------------------------------------------
+# ---- what a checkpoint may hold -------------------------------------------------------------------------------------
 
 _KINDS = {int: "a whole number from 0", dict: "a mapping"}
 _ADAM = ("step", "exp_avg", "exp_avg_sq")  # Adam's state of a parameter
@@ -119,7 +119,7 @@ def check_content(content: Any, path: Path) -> dict[str, Any]:
 def check_resume(
     content: Mapping[str, Any], path: Path, optimizer: torch.optim.Optimizer, task: Mapping[str, Tensor]
 ) -> None:
-    """Raise ConfigError unless training can go on: counter as in the file's name, state of ``optimizer`` and of the ``task``."""
+    """Raise ConfigError unless training can go on: the file's name, state of ``optimizer``, state of the ``task``."""
     check = Checker(path)
     done = check.take(content, "iter", int)
     if (named := re.fullmatch(r"model_(\d+)\.pt", path.name)) and int(named[1]) != done:
@@ -129,7 +129,7 @@ def check_resume(
 
 
 def check_fit(saved: dict[str, Tensor], wanted: dict[str, Tensor], path: Path, what: str) -> None:
-    """Raise ConfigError unless the parameters ``saved`` in ``path`` are those ``wanted`` by the network of the config."""
+    """Raise ConfigError unless the parameters ``saved`` in ``path`` fit those ``wanted`` by the network."""
     has, wants = (any(name.startswith("rnn.") for name in names) for names in (saved, wanted))
     if saved and has != wants:
         where, not_where = ("there", "here") if has else ("here", "there")
@@ -273,9 +273,9 @@ def _short(value: object) -> str:
     return brief(value, 60) if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"
 
 
-# ---- the worlds beside a checkpoint ------------------------------------------------------------------------------------
-# A file of their own, as it is large and not needed to play a policy. It is written before its checkpoint, and the file of
-# the checkpoint before is deleted after, so that a kill at any moment leaves the newest checkpoint with its worlds.
+# ---- the worlds beside a checkpoint ---------------------------------------------------------------------------------
+# A file of their own, as it is large and not needed to play a policy. It is written before its checkpoint, and the file
+# of the checkpoint before is deleted after, so that a kill at any moment leaves the newest checkpoint with its worlds.
 
 _MOST = 1e10  # a state beyond it has blown up for MuJoCo: mjMAXVAL
 _FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections of the config that a resumed run may change
@@ -302,7 +302,7 @@ def worlds_content(runner: Any) -> dict[str, Any]:
 
 
 def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Tensor]) -> str:
-    """Restore worlds and memories of ``checkpoint``, in which the generators were as ``random``; returns why not, or ''."""
+    """Restore worlds and memories of ``checkpoint``, whose generators are ``random``; returns why not, or ''."""
     file = worlds_file(checkpoint, rank)
     if not file.is_file():
         return f"there is no {file.name} beside it"

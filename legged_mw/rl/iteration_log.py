@@ -1,4 +1,4 @@
-"""The log of a training: numbers of an iteration from the device, what the user sees of them, and when they must end it."""
+"""The log of a training: an iteration's numbers, console, curves, and the check that ends a dead training."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Report(NamedTuple):
         return Clock.seconds(begin, collected), Clock.seconds(collected, end)
 
 
-# ---- rows of the console, and curves -----------------------------------------------------------------------------------
+# ---- rows of the console, and curves --------------------------------------------------------------------------------
 
 _KNOWN = ("reward", "episode_length", "episodes", "fell", "broken", "overflowed", "learning_rate", "action_std")
 _APART = ("rew_", "broken_by")  # prefixes of numbers that have lines of their own
@@ -110,6 +110,7 @@ def console_rows(
     def mean(name: str, digits: int) -> str:
         return _number(numbers[name], digits)
 
+    ends = f"{numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite"
     return {
         "Computation": f"{speed:.0f} steps/s (collection {collect:.3f} s, learning {learn:.3f} s)",
         **{f"{name.capitalize()} loss": f"{value:.4f}" for name, value in losses.items()},
@@ -119,7 +120,7 @@ def console_rows(
         "Mean episode length": mean("episode_length", 1),
         **{name: mean(name, 4) for name in numbers if name.startswith("rew_")},
         **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in _of_the_task(numbers)},
-        "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
+        "Episodes ended": f"{numbers['episodes']:.0f} ({ends})",
     }
 
 
@@ -166,7 +167,7 @@ def quiet_writers() -> None:
         threading.excepthook = show
 
 
-# ---- the console -------------------------------------------------------------------------------------------------------
+# ---- the console ----------------------------------------------------------------------------------------------------
 
 LOG_FILE = "training.log"  # in the run folder: the blocks of all iterations, also of those before a resume
 _WINDOW = 50  # latest iterations that the remaining time is estimated from: the first ones record and compile
@@ -175,8 +176,8 @@ _WINDOW = 50  # latest iterations that the remaining time is estimated from: the
 class Console:
     """Prints a line an iteration, with a progress bar below it on a terminal, and writes blocks to the log file.
 
-    As a context it keeps the bar below the lines that others print. ``listeners`` are called after each iteration with its
-    number, and must not raise.
+    As a context it keeps the bar below the lines that others print. ``listeners`` are called after each iteration with
+    its number, and must not raise.
     """
 
     def __init__(self, verbose: bool = False) -> None:
@@ -191,7 +192,7 @@ class Console:
 
     def open(self, folder: Path) -> None:
         """From now on, append blocks to the log file in ``folder``."""
-        self._file = self._try(lambda: open(folder / LOG_FILE, "a", encoding="utf-8"))  # noqa: SIM115 (open until the training ends)
+        self._file = self._try(lambda: open(folder / LOG_FILE, "a", encoding="utf-8"))  # noqa: SIM115
 
     def iteration(
         self, done: int, last: int, exam: int | None, numbers: Mapping[str, float], rows: dict[str, str], speed: float
@@ -266,7 +267,7 @@ class Console:
             self._drawn = False
 
     def draw(self) -> None:
-        """Draw the bar as wide as the terminal allows. The cursor stays at its start, so that any other line replaces it."""
+        """Draw the bar. The cursor stays at its start, so that any other line replaces it."""
         if self._bar is None or self._out is None:
             return
         done, last, exam = self._bar
@@ -309,7 +310,7 @@ def _clock(seconds: float) -> str:
     return str(timedelta(seconds=round(seconds)))
 
 
-# ---- values that are not finite ----------------------------------------------------------------------------------------
+# ---- values that are not finite -------------------------------------------------------------------------------------
 
 IN_A_ROW = 3  # ours: iterations; one bad value is an accident, and the next rollout is another
 
@@ -318,7 +319,7 @@ class FiniteCheck:
     """Warns of values that are not finite, and says when a training must end for them."""
 
     def __init__(self, names: Sequence[str], stored: Sequence[str]) -> None:
-        """``names`` of the values that the step counts, and of the ``stored`` columns that an update reads, in words."""
+        """``names`` of the values that the step counts; ``stored``: names of the columns that an update reads."""
         self._names, self._stored = names, stored
         self.undone = 0  # updates rolled back, in all
         self._undone_in_a_row = 0

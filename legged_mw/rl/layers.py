@@ -20,8 +20,8 @@ _SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by si
 class Linear(torch.autograd.Function):
     """``x W^T + b`` for many rows, faster than torch's own in two places.
 
-    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns than
-    the weight, of zeros: a multiple of four of them is what TF32 products want.
+    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns
+    than the weight, of zeros: a multiple of four of them is what TF32 products want.
     """
 
     @staticmethod
@@ -54,9 +54,9 @@ def sum_rows(x: Tensor) -> Tensor:
 class EluLayers(torch.autograd.Function):
     """Linear layers with an ELU after each but the last, which reads and says float32.
 
-    ``read``: weight and bias of each as the products read them: their own, or rounded to bfloat16, in which all before the last
-    is then computed; sums and the gradients of weights are float32 all the same. ``x`` and the first weight may have more columns,
-    of zeros.
+    ``read``: weight and bias of each as the products read them: their own, or rounded to bfloat16, in which all before
+    the last is then computed; sums and the gradients of weights are float32 all the same. ``x`` and the first weight
+    may have more columns, of zeros.
     """
 
     @staticmethod

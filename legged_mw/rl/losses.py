@@ -1,6 +1,7 @@
 """PPO's losses and their gradients with respect to the networks' outputs, in closed form: on a GPU one kernel each, not fifty.
 
-What autograd would find, for a Gaussian policy. Tensors are of B samples, the mirror images after the samples they are of.
+What autograd would find, for a Gaussian policy. Tensors are of B samples, the mirror images after the samples they are
+of.
 """
 
 from __future__ import annotations

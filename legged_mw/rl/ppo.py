@@ -36,7 +36,7 @@ _MIN_RATE, MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning ra
 
 
 class Recorded:
-    """First parent of a recorded learner; the second is rsl-rl's algorithm, which does everything if not ``graphed``."""
+    """First parent of a recorded learner. The second, rsl-rl's algorithm, does everything if not ``graphed``."""
 
     graphed: bool
     learning_rate: float
@@ -104,10 +104,10 @@ class Minibatch(NamedTuple):
 class GraphedPPO(Recorded, PPO):
     """PPO whose acting and update are replayed CUDA graphs.
 
-    Minibatches are drawn from samples, or from whole worlds if a network has a memory (RNNModel). The first three updates
-    run eagerly and the fourth is recorded, so none is wasted on warming up. rsl-rl's own update runs instead, and a line
-    says so, with a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed precision, an optimizer
-    other than Adam or AdamW, or a distribution that is not Gaussian.
+    Minibatches are drawn from samples, or from whole worlds if a network has a memory (RNNModel). The first three
+    updates run eagerly and the fourth is recorded, so none is wasted on warming up. rsl-rl's own update runs instead,
+    and a line says so, with a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed precision,
+    an optimizer other than Adam or AdamW, or a distribution that is not Gaussian.
     """
 
     critic_only = False  # during the warm-up of a warm start: the actor does not learn
@@ -182,8 +182,8 @@ class GraphedPPO(Recorded, PPO):
     def learn_critic_only(self, on: bool) -> None:
         """From the next update on, train the critic only, or both networks again.
 
-        When both learn again, an adaptive learning rate begins at its lowest, so that the actor unlearns nothing; within an
-        update it has risen to where it belongs.
+        When both learn again, an adaptive learning rate begins at its lowest, so that the actor unlearns nothing;
+        within an update it has risen to where it belongs.
         """
         if on != self.critic_only:
             self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
@@ -193,8 +193,8 @@ class GraphedPPO(Recorded, PPO):
     def learn_in_half(self) -> None:
         """Compute the hidden layers of plain networks of ELUs in bfloat16, from now on.
 
-        Acting too, or the policy that learns would differ from the one that acted. Weights and their gradients, the last
-        layer, sums and losses stay float32.
+        Acting too, or the policy that learns would differ from the one that acted. Weights and their gradients, the
+        last layer, sums and losses stay float32.
         """
         torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction = False
         self.half = True
@@ -246,7 +246,7 @@ class GraphedPPO(Recorded, PPO):
         return self._forward(model, self._half[model].prepare(latent)) if model in self._half else model.mlp(latent)
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
-        """The input of the network's MLP. A memory takes in ``seen``: the observations, and their mirror images if it learns from them."""
+        """The MLP's input. A memory takes in ``seen``: the observations, with mirror images if it learns from them."""
         if model in self._memories:
             return self._memories[model].advance(seen)
         return model.rollout_latent(self._obs) if isinstance(model, RegressingModel) else model.get_latent(self._obs)
@@ -271,7 +271,7 @@ class GraphedPPO(Recorded, PPO):
     # ---- the update -----------------------------------------------------------------------------------------------
 
     def update(self) -> dict[str, Any]:
-        """Learn from the storage; returns mean losses as tensors (), which wait for the device only when they are read."""
+        """Learn from the storage; returns mean losses as tensors ()."""
         if not self.graphed:
             return super().update()
         torch.randperm(len(self._order), out=self._order)  # one for all epochs, as in rsl-rl
@@ -313,7 +313,8 @@ class GraphedPPO(Recorded, PPO):
             old_distribution_params=tuple(take(stored) for stored in st.distribution_params),
         )
         if self.normalize_advantage_per_mini_batch:
-            batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
+            advantages: Any = batch.advantages
+            batch.advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
         actor_input = self._input(self.actor, batch.observations, indices)
@@ -361,7 +362,7 @@ class GraphedPPO(Recorded, PPO):
     def _policy_loss(
         self, batch: Any, output: Tensor
     ) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], Tensor | None]:
-        """(tensor, gradient) pairs of the actor, loss terms in the order of ``_loss_names``, KL divergence (None: fixed rate)."""
+        """(tensor, gradient) pairs of the actor, loss terms as in ``_loss_names``, and the KL (None: fixed rate)."""
         assert self.actor.distribution is not None
         self.actor.distribution.update(output)
         mean, std = self.actor.output_mean, own_std(self.actor.distribution)  # type: ignore[arg-type]
@@ -440,7 +441,7 @@ class GraphedPPO(Recorded, PPO):
         _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
 
-    # ---- the learning rate --------------------------------------------------------------------------------------------
+    # ---- the learning rate ------------------------------------------------------------------------------------------
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load a checkpoint; clip its learning rate to the bound."""
@@ -472,13 +473,13 @@ def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | N
     """Raise ConfigError for settings that a recurrent network cannot learn with."""
     if worlds < minibatches:
         raise ConfigError(
-            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, and env.num_envs is {worlds}: "
-            "raise the latter or lower the former"
+            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, "
+            f"and env.num_envs is {worlds}: raise the latter or lower the former"
         )
     if symmetry and not (recorded and symmetry["use_data_augmentation"]):
         raise ConfigError(
-            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
-            "update; switch the former on, or both off"
+            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both "
+            "this project's recorded update; switch the former on, or both off"
         )
 
 
@@ -502,7 +503,7 @@ class RegressingModel(MLPModel):
 
     @staticmethod
     def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-        """Constructor arguments beyond MLPModel's, from the learner's config; see ``actor_settings``. Raises ConfigError."""
+        """Constructor arguments beyond MLPModel's, see ``actor_settings``. Raises ConfigError."""
         raise NotImplementedError
 
     def rollout_latent(self, obs: TensorDict) -> Tensor:
@@ -561,7 +562,7 @@ class Memory(Protocol):
         """A copy of the state in rsl-rl's form."""
 
     def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequenced:
-        """The rollout of ``worlds`` (B,): ``inputs`` (S * T * B, size), and ``dones`` (T, N, 1), 1 where a step ended an episode."""
+        """The rollout of ``worlds`` (B,), from ``inputs`` (S * T * B, size) and ``dones`` (T, N, 1) after each step."""
         ...
 
     def unroll(self, sequence: Sequenced) -> Tensor:
@@ -607,14 +608,14 @@ class UpdateRollback:
     def __init__(self, learner: Any, networks: Iterable[nn.Module]) -> None:
         """``learner`` has rsl-rl's ``storage`` and ``optimizer``; ``networks`` are the networks that learn."""
         self._learner, self._networks, stored = learner, list(networks), learner.storage.observations
-        self.columns = [(group, i) for group in stored.keys() for i in range(stored[group][0, 0].numel())]  # noqa: SIM118 (a TensorDict)
+        self.columns = [(group, i) for group, value in stored.items() for i in range(value[0, 0].numel())]
         device = learner.storage.rewards.device
         self.undone = torch.zeros((), device=device)  # 1 if the last update was rolled back
         # 1 where the last update read a bad value: by column of the observations, then the rewards
         self.wrong = torch.zeros(len(self.columns) + 1, device=device)
 
     def _learned(self) -> dict[str, Tensor]:
-        """Parameters, normalisers, the optimizer's state, learning rates, by name: rsl-rl's own normaliser rebinds its std."""
+        """Name -> tensor of all that an update changes, as of now: rsl-rl's own normaliser rebinds its std."""
         optimizer, values = self._learner.optimizer, dict[str, Any]()
         for i, network in enumerate(self._networks):
             values |= {f"{i}.{name}": value for name, value in (*network.named_parameters(), *network.named_buffers())}
@@ -631,7 +632,7 @@ class UpdateRollback:
 
     @torch.no_grad()
     def finish(self, losses: Tensor | None = None) -> None:
-        """Judge the update by its inputs, results and ``losses``; restore the state if it was bad, and set ``undone``."""
+        """Restore the state if inputs, results or ``losses`` of the update are bad; set ``undone`` and ``wrong``."""
         stored = self._learner.storage
         wrong = [_beyond(value.flatten(0, 1).flatten(1)) for value in (*stored.observations.values(), stored.rewards)]
         self.wrong.copy_(torch.cat([*wrong[:-1], wrong[-1].any()[None]]))

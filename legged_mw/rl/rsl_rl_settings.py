@@ -1,4 +1,7 @@
-"""The learner's config as rsl-rl takes it."""
+"""The learner's config as rsl-rl takes it: settings, the classes that a config may name, their memory, mirror images.
+
+Not in learner_config.py: tasks import that, and it holds numbers and names only.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +54,7 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[st
 
 
 def _check_bound(algorithm: dict[str, Any]) -> None:
-    """Take ``max_learning_rate`` out where it is rsl-rl's own, so that any class may be named; refuse one that nothing would read."""
+    """Drop ``max_learning_rate`` if it is rsl-rl's own; raise ConfigError if no class would read it."""
     if algorithm["max_learning_rate"] == MAX_RATE:
         del algorithm["max_learning_rate"]
         return
@@ -63,7 +66,8 @@ def _check_bound(algorithm: dict[str, Any]) -> None:
     if algorithm["schedule"] == "fixed":
         raise ConfigError(
             f"algorithm.max_learning_rate is {bound:g}, but algorithm.schedule is 'fixed', which has no bound: "
-            f"the rate is algorithm.learning_rate throughout. Leave the bound at {MAX_RATE:g}, or take the schedule 'adaptive'"
+            f"the rate is algorithm.learning_rate throughout. Leave the bound at {MAX_RATE:g}, "
+            "or take the schedule 'adaptive'"
         )
     if rate > bound:
         raise ConfigError(
@@ -84,8 +88,8 @@ ALLOWED: dict[str, tuple[type | str, ...]] = {
     "algorithm.class_name": ("legged_mw.rl.ppo:GraphedPPO", PPO),
     "distillation.class_name": ("legged_mw.rl.students.distillation:GraphedDistillation", Distillation),
 }
-_RECURRENT = "legged_mw.rl.students.recurrent:RecurrentModel"  # what an RNNModel is here
-# the field of the actor's section that asks for it -> the network, imported then
+_RECURRENT = "legged_mw.rl.students.recurrent:RecurrentModel"  # takes the place of rsl-rl's RNNModel
+# the field of section `actor` that selects it -> the network, imported when it is selected
 _ESTIMATOR, _CONCURRENT = "actor.estimator.targets", "actor.concurrent.groups"
 _STUDENTS = {
     _ESTIMATOR: "legged_mw.rl.students.estimator:EstimatingModel",
@@ -95,7 +99,11 @@ _IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls
 
 
 def check_classes(cfg: Config) -> None:
-    """Refuse a class that neither the task's own Python file nor ``ALLOWED`` names. Imports nothing. Raises ConfigError."""
+    """Raise ConfigError for a class that neither the task's own Python file nor ``ALLOWED`` names. Imports nothing.
+
+    rsl-rl imports and calls the value of ``class_name``, and a run folder may be a stranger's: its config.yaml must not
+    choose code.
+    """
     for network in ("actor", "critic"):
         _check_distribution(cfg.to_dict().get(network, {}).get("distribution_cfg"), f"{network}.distribution_cfg")
     own = dict(_class_names(type(cfg)().to_dict()))
@@ -112,27 +120,29 @@ def check_classes(cfg: Config) -> None:
 
 
 def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool = True) -> dict[str, Any]:
-    """Section ``actor`` of the learner's ``sections`` as rsl-rl takes it, with the class that its parts ask for. Raises ConfigError.
+    """Section ``actor`` as rsl-rl takes it, with the class that its subsections select. Raises ConfigError.
 
-    ``learns``: False for an actor that only acts, in worlds that may be without what the learner knew.
+    ``sections``: the learner's config. ``learns``: False for an actor that only acts, in worlds that may lack the rows
+    it learned from.
     """
     actor = {name: value for name, value in sections["actor"].items() if name not in ("estimator", "concurrent")}
     parts = sections["actor"]
     named = {_ESTIMATOR: parts["estimator"]["targets"], _CONCURRENT: parts["concurrent"]["groups"]}
-    asked = [field for field, names in named.items() if names]
-    if not asked:
+    fields = [field for field, names in named.items() if names]
+    if not fields:
         return actor
-    if len(asked) > 1:
-        raise ConfigError(f"{' and '.join(asked)} are both set: the actor reads an estimate or a latent; empty one")
+    if len(fields) > 1:
+        raise ConfigError(f"{' and '.join(fields)} are both set: the actor reads an estimate or a latent; empty one")
     if actor["class_name"] != "MLPModel":
-        raise ConfigError(f"{asked[0]}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
+        raise ConfigError(f"{fields[0]}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
     assert env is not None
-    name = _STUDENTS[asked[0]]
-    return {**actor, **resolve_callable(name).settings(sections, env, learns), "class_name": name}  # type: ignore[attr-defined]
+    name = _STUDENTS[fields[0]]
+    model: Any = resolve_callable(name)
+    return {**actor, **model.settings(sections, env, learns), "class_name": name}
 
 
 def network_section(section: dict[str, Any]) -> dict[str, Any]:
-    """The section of a network as rsl-rl takes it, without the fields of a memory if its class has none.
+    """The section of a network as rsl-rl takes it; without the fields ``rnn_...`` if its class has none.
 
     Imports the class: check it first.
     """
@@ -143,19 +153,20 @@ def network_section(section: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
-    """rsl-rl makes a distribution of its own from all fields of the section, so it must take them."""
+    """Raise ConfigError if a distribution of rsl-rl does not take all fields of its section."""
     name = (section or {}).get("class_name")
     for kind in (*_DISTRIBUTIONS, BetaDistribution):
         surplus = sorted((section or {}).keys() - inspect.signature(kind).parameters.keys() - {"class_name"})
         if surplus and name in spellings(kind):
             fit = ", ".join(other.__name__ for other in _DISTRIBUTIONS)
             raise ConfigError(
-                f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; there fit: {fit}"
+                f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; "
+                f"there fit: {fit}"
             )
 
 
 def spellings(kind: type | str) -> list[str]:
-    """All names under which rsl-rl finds a class, which may be written as ``module:name``, the shortest first."""
+    """All names by which rsl-rl finds a class, the shortest first. A string is ``module:name``."""
     module, name = kind.split(":") if isinstance(kind, str) else (kind.__module__, kind.__qualname__)
     long = [f"{module}:{name}", f"{module}.{name}"]
     if not module.startswith("rsl_rl."):
@@ -165,7 +176,7 @@ def spellings(kind: type | str) -> list[str]:
 
 
 def _class_names(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted path, value) of everything in nested mappings and lists that rsl-rl would import."""
+    """(dotted path, value) of each class that nested mappings and lists name."""
     items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
     for key, value in items:
         here = f"{path}.{key}" if path else str(key)
@@ -181,9 +192,9 @@ _FLOAT = 4  # [byte]
 
 
 def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> None:
-    """Refuse what memory has no room for, with the field that asks the most. Raises UserError.
+    """Raise UserError if networks and rollout do not fit the memory; it names the largest field.
 
-    ``sections`` is the learner's config as a mapping. Without ``learns`` it is about an actor that only acts.
+    ``sections``: the learner's config. ``learns``: False for an actor that only acts.
     """
     device, sizes = str(env.device), {group: buffer.shape[1] for group, buffer in env.obs_buf.items()}
     counts = {
@@ -197,7 +208,7 @@ def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) ->
     value = sections
     for part in field.split("."):
         value = value[part]
-    copies = 4 if learns else 1  # beside the weights their gradients, and Adam's two moments
+    copies = 4 if learns else 1  # weights, gradients, and Adam's two moments
     require_memory(
         _FLOAT * copies * sum(counts.values()), device, f"{field} = {value}", "fewer values a layer need less"
     )
@@ -210,7 +221,7 @@ def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) ->
 
 
 def _weights(sections: dict[str, Any], name: str, seen: int) -> dict[str, int]:
-    """Field -> weights that it asks for, of the network ``name``, which reads ``seen`` values."""
+    """Field -> number of weights, of the network ``name`` with ``seen`` inputs."""
     section, counts = sections[name], {}
     if "RNN" in section["class_name"]:
         hidden = section["rnn_hidden_dim"]
@@ -235,10 +246,12 @@ def _chain(sizes: list[int]) -> int:
 
 
 def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
-    """rsl-rl's ``data_augmentation_func``: observations (2B,) by group and actions (2B, A), the B given first, then their mirror images.
+    """rsl-rl's ``data_augmentation_func``: the observations and actions of B samples, then of their mirror images.
 
-    ``obs`` may hold any of the environment's groups. It asks the host nothing, so that a CUDA graph can record it; look at
-    ``env.mirror`` before recording, as its first use makes tensors.
+    Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024.
+
+    ``obs`` may hold any of the environment's groups. It asks the host nothing, so that a CUDA graph can record it; look
+    at ``env.mirror`` before recording, as its first use makes tensors.
     """
     table = env.mirror
     if obs is not None:

@@ -33,7 +33,7 @@ def logs_folder() -> Path:
 
 
 def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
-    """The folder of a task's runs, or of the experiment called ``name``. Raises UserError for a name that is not allowed."""
+    """The folder of a task's runs, or of the experiment ``name``. Raises UserError for a name that is not allowed."""
     return logs_folder() / check_name(
         name or task.train.runner.experiment_name or task.name, "the name of the experiment"
     )
@@ -70,7 +70,7 @@ def checkpoints(run: Path) -> dict[int, Path]:
 
 
 def find_run(experiment: Path, name: str) -> Path:
-    """The run called ``name`` below ``experiment``, a path to one (maybe a stranger's), or for "-1" the run last trained."""
+    """The run called ``name`` below ``experiment``, or at the path ``name``, or for "-1" the run last trained."""
     found, given = runs(experiment), typed(name)
     if name == "-1":
         if not found:
@@ -97,7 +97,7 @@ def find_checkpoint(run: Path, iteration: int) -> Path:
 
 
 def task_of(run: Path, named: LoadedTask | None = None) -> str:
-    """The ``--task`` of the run in the folder ``run``: a task of the project, or a file that the task ``named`` is or extends.
+    """The ``--task`` of a run: a task of the project, or a file that the task ``named`` is or extends.
 
     No other file: a file is code, and the run may be a stranger's. Raises ConfigError that says what to type.
     """
@@ -106,9 +106,8 @@ def task_of(run: Path, named: LoadedTask | None = None) -> str:
         raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
     if found := of_project(stored) or (named and named.file_called(Path(stored).name)):
         return str(found)
-    raise ConfigError(
-        f"{shown(run)} is of task {stored[:200]!r}, {somebodys(stored)}{', or a task that extends its config' if named else ''}"
-    )
+    extending = ", or a task that extends its config" if named else ""
+    raise ConfigError(f"{shown(run)} is of task {stored[:200]!r}, {somebodys(stored)}{extending}")
 
 
 def task_at(path: str) -> str:
@@ -161,10 +160,10 @@ class RunLock:
 
 
 class CheckpointWriter:
-    """Writes checkpoints of a training and prunes old ones. If one cannot be written, it warns and the training goes on."""
+    """Writes checkpoints and prunes old ones. If one cannot be written, it warns and the training goes on."""
 
     def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:
-        """``keep``: how many newest checkpoints stay, 0 for all. ``prepare``: make the folder if it is gone; returns whether it was."""
+        """``keep``: number of newest checkpoints that stay, 0: all. ``prepare``: make a lost folder, return whether."""
         self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
         self.failed = ""  # why the newest checkpoint could not be written, or ''
         self.written: Path | None = None  # the newest one that was written
@@ -197,7 +196,7 @@ class CheckpointWriter:
         return True
 
     def _write_worlds(self, worlds: Callable[[], dict[str, Any]], file: Path, checkpoint: Path) -> None:
-        """Write the file of worlds if there is room. It is many times as large as the checkpoint, which may fit without it."""
+        """Write the worlds if there is room: they are many times as large as the checkpoint, which may fit without."""
         try:
             save_whole(worlds(), file, sync=False)  # its reader detects a file torn by a power cut
         except (OSError, MemoryError) as error:
@@ -209,8 +208,8 @@ class CheckpointWriter:
     def _prune(self) -> None:
         """Delete worlds of checkpoints before the newest, and the oldest checkpoints.
 
-        A rank that comes here before the first one has written the newest checkpoint leaves the worlds of the one before.
-        The first rank also deletes worlds of an earlier training with another number of processes.
+        A rank that comes here before the first one has written the newest checkpoint leaves the worlds of the one
+        before. The first rank also deletes worlds of an earlier training with another number of processes.
         """
         there = checkpoints(self.folder)
         newest, rank = max(there, default=0), self._rank

@@ -162,7 +162,7 @@ class Runner(OnPolicyRunner):
         self.schedule.done, self.console.deadline = first_ranks(self.schedule.done, self.device), self.deadline
 
     def _anneal(self) -> None:
-        """Set the annealed numbers, on a straight line from the first iteration to the last; end the critic's warm-up."""
+        """Set the annealed numbers, linear from the first iteration to the last; end the critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
             self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
         done = self.schedule.begin(self.current_learning_iteration)
@@ -172,7 +172,7 @@ class Runner(OnPolicyRunner):
         self.env.on_training_progress(done)
 
     def _must_stop(self) -> bool:
-        """Whether to stop. Ranks stop together, one iteration after the first signal: they wait for each other in every update."""
+        """Whether to stop. Ranks stop together, one iteration after the first signal: an update needs all of them."""
         if not self.is_distributed:
             return self.stop is not None
         if self._all_stop:
@@ -273,7 +273,7 @@ class Runner(OnPolicyRunner):
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
     def _action_std(self) -> Tensor:
-        """Mean standard deviation () of the actions in the last rollout; of a distribution that is not Gaussian, the present one."""
+        """Mean standard deviation () of the actions: of a Gaussian in the last rollout, else the present one."""
         policy, params = self.alg.get_policy(), getattr(self.alg.storage, "distribution_params", None)
         if isinstance(policy.distribution, GaussianDistribution) and params is not None:
             return params[1].mean()
@@ -358,7 +358,7 @@ class Runner(OnPolicyRunner):
         return {name: getattr(self.alg, name) for name in names}
 
     def _save_checkpoint(self) -> None:
-        """Write a checkpoint, unless the networks are not finite: training must be able to go on from the newest one."""
+        """Write a checkpoint if the networks are finite: training must be able to go on from the newest one."""
         done = self.current_learning_iteration
         weights = [weight for network in self._networks().values() for weight in network.parameters()]
         if not all(bool(weight.isfinite().all()) for weight in weights):
@@ -391,7 +391,7 @@ class Runner(OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Load a checkpoint: networks, normalisers, optimizer, learning rate, counters, random state, and the worlds beside it."""
+        """Load a checkpoint, and the worlds beside it if they are the same."""
         content = load_tensors(Path(path), map_location or self.device)
         (first, actor), (second, other) = self._networks().items()
         check_fit(content.get(f"{first}_state_dict", {}), actor.state_dict(), Path(path), first)
@@ -426,7 +426,7 @@ class Runner(OnPolicyRunner):
 def make_runner(
     env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None
 ) -> Runner:
-    """A runner over ``env`` from the learner's config. With a ``teacher``'s it distils; without ``log_dir`` it writes nothing."""
+    """A runner over ``env``. With the config of a ``teacher`` it distils; without ``log_dir`` it writes nothing."""
     half = cfg.runner.matmul_precision == "bf16"
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
@@ -467,12 +467,12 @@ _WINDOW = 50  # iterations, whose median duration says how many more there is ti
 class TrainingSchedule:
     """The last iteration of a training, and how much of it is ``done``: 0 in the first iteration, 1 in the last.
 
-    With a ``deadline`` the last iteration is an estimate, made again after each iteration, and ``done`` rises to 1 in even
-    steps over the iterations left. So compiling, exams and checkpoints change the steps but not the end.
+    With a ``deadline`` the last iteration is an estimate, made again after each iteration, and ``done`` rises to 1 in
+    even steps over the iterations left. So compiling, exams and checkpoints change the steps but not the end.
     """
 
     def __init__(self, last: int = 0, deadline: float | None = None, used: float = 0.0) -> None:
-        """Until the iteration ``last`` or the ``deadline`` [s, time.time()]; ``used`` [s]: time of the training before a resume."""
+        """Until the iteration ``last`` or the ``deadline`` [s, time.time()]; ``used`` [s]: duration before a resume."""
         self.last = self._wanted = last  # with a deadline, an estimate
         self.deadline, self._used, self._begun = deadline, used, time.time()
         room = max(deadline - self._begun, 0.0) if deadline else 0.0
@@ -515,8 +515,8 @@ class TrainingSchedule:
 # ---- threads of an update on a CPU ----------------------------------------------------------------------------------
 
 
-# An update is some thousand small parallel regions, and each waits for its slowest thread. If another process takes a core
-# away, all threads wait for the scheduler, again and again: measured up to 60 times slower than one thread.
+# An update is some thousand small parallel regions, and each waits for its slowest thread. If another process takes a
+# core away, all threads wait for the scheduler, again and again: measured up to 60 times slower than one thread.
 _SLOW = 3.0  # ours: an update this many times slower than the one before starts a trial; noise stays below 2
 _GAIN = 1.2  # ours: the other number must be this many times faster to be chosen
 _PATIENCE = 50  # ours: updates on one thread before all cores are tried again; doubled each time that does not help
@@ -567,9 +567,10 @@ def better(times: dict[int, float], settled: int) -> int:
 
 
 class UpdateThreads:
-    """Context of an update: sets torch's number of threads, and restores it, as a step's small operations want one thread.
+    """Context of an update: torch's number of threads. A step's small operations want one thread, so it is restored.
 
-    ``count`` 0: one thread or all ``cores``, whichever is faster; tried again when an update takes far longer than usual.
+    ``count`` 0: one thread or all ``cores``, whichever is faster; tried again when an update takes far longer than
+    usual.
     """
 
     def __init__(self, count: int, cores: int) -> None:

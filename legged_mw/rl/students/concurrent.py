@@ -1,9 +1,10 @@
 """Concurrent teacher and student: one policy that reads a latent, which a teacher's encoder makes of what only the simulator knows, and a
 student's of what a robot has felt.
 
-Part of the worlds act by the teacher's latent, the rest by the student's. PPO learns from all of them: the policy, and in the teacher's
-worlds the teacher's encoder with it. The student's encoder learns by regression to the teacher's latent alone, in all worlds. During an
-update the policy reads the student's latent that it acted with. What plays and is exported is the student's path.
+Part of the worlds act by the teacher's latent, the rest by the student's. PPO learns from all of them: the policy, and
+in the teacher's worlds the teacher's encoder with it. The student's encoder learns by regression to the teacher's
+latent alone, in all worlds. During an update the policy reads the student's latent that it acted with. What plays and
+is exported is the student's path.
 
 Wang et al., "CTS: Concurrent Teacher-Student Reinforcement Learning for Legged Locomotion", RA-L 2024.
 """

@@ -25,8 +25,9 @@ from legged_mw.sim.graph import StepGraph
 class GraphedDistillation(Recorded, Distillation):
     """Distillation whose acting and update are replayed CUDA graphs.
 
-    What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer other than
-    Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. On a CPU nothing is recorded.
+    What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer
+    other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. On
+    a CPU nothing is recorded.
     """
 
     def __init__(self, student: MLPModel, teacher: MLPModel, storage: RolloutStorage, **settings: Any) -> None:

@@ -1,8 +1,8 @@
 """An actor that reads its own estimate of what a robot cannot measure, and the regression that trains the estimator.
 
-The estimator goes from the actor's observations to rows that only the simulator knows. The policy reads the estimate beside its
-observations, but no gradient of the policy reaches the estimator, and none of the estimator the policy. During an update the policy
-reads the estimate that it acted with; the estimator learns beside it.
+The estimator goes from the actor's observations to rows that only the simulator knows. The policy reads the estimate
+beside its observations, but no gradient of the policy reaches the estimator, and none of the estimator the policy.
+During an update the policy reads the estimate that it acted with; the estimator learns beside it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """GRU and LSTM networks in a recorded rollout and update, and what a policy with a memory needs wherever it acts.
 
-rsl-rl cuts a rollout into episodes and pads them to one length: a shape that depends on data. Here the network runs over the
-T steps of the rollout with all worlds side by side, and the state of a world becomes 0 before the step that begins an episode:
-the same values and gradients. cuDNN cannot change a state on the way, so each step is a product and a few kernels of its own.
+rsl-rl cuts a rollout into episodes and pads them to one length: a shape that depends on data. Here the network runs
+over the T steps of the rollout with all worlds side by side, and the state of a world becomes 0 before the step that
+begins an episode: the same values and gradients. cuDNN cannot change a state on the way, so each step is a product and
+a few kernels of its own.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ class SequenceInput(NamedTuple):
 class HiddenState:
     """The state of a recurrent network in each of N worlds, in tensors that stay.
 
-    With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has no mirror image
-    of its own.
+    With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has
+    no mirror image of its own.
     """
 
     def __init__(self, model: RNNModel, worlds: int, images: int, device: str) -> None:
@@ -150,8 +151,9 @@ def unroll(rnn: nn.RNNBase, sequence: SequenceInput) -> Tensor:
     return x.flatten(0, 2)
 
 
-# The two layers below take what torch's GRU and LSTM make of the inputs, (S, T, B, gates * H), and run the rest, the state's part,
-# step by step. In the backward pass the gradient of every gate is that of h (or c) times a factor: all factors are made at once.
+# The two layers below take what torch's GRU and LSTM make of the inputs, (S, T, B, gates * H), and run the rest, the
+# state's part, step by step. In the backward pass the gradient of every gate is that of h (or c) times a factor: all
+# factors are made at once.
 
 
 class GRU(torch.autograd.Function):
