@@ -1,1 +1,1 @@
-"""A trained policy to take away: network, contract, scene, and their comparison with what was trained. Nothing in rl imports it."""
+"""Exports a run as network, contract and scene, which are compared with the training first. rl imports none of it."""

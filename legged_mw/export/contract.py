@@ -1,4 +1,4 @@
-"""The contract and the scenes of an export, from the environment that it was trained in."""
+"""Contract and scenes of an export, made from the environment of its training."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
 
 
 def _exam(task: LoadedTask) -> dict[str, Any] | None:
-    """What grades an export: the section ``exam``, and its kind where that is not the walking exam."""
+    """The exam of an export: the section ``exam``, and its kind if that is not the walking exam."""
     section = task.cfg.to_dict().get("exam", {})
     if task.exam == "walking":  # a task's own fields are no part of it
         return {name: section[name] for name in LeggedRobotCfg().to_dict()["exam"] if name in section}
@@ -119,12 +119,12 @@ def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
 
 
 def _write_scene(env: RobotTask, folder: Path) -> Scene:
-    """The robot in its start, as MJCF."""
+    """The robot at its start, as MJCF."""
     cfg, robot, law = env.cfg, env.robot, env.actuators.law
     if law == OWN_LAW:
         raise ExportError(
-            f"{type(env).__name__}._compute_torques is a motor law in code, which no export can state; train the policy that is to be "
-            "exported with a law of control.actuator (docs/motors.md)"
+            f"{type(env).__name__}._compute_torques is a motor law in code, which no export can state; "
+            "train the policy that is to be exported with a law of control.actuator (docs/motors.md)"
         )
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
     if isinstance(env, MotionTracking):
@@ -147,7 +147,7 @@ def _motors(env: RobotTask, folder: Path) -> Motors:
 
 
 def _motion(env: RobotTask, folder: Path) -> Motion | None:
-    """What the policy follows, whose frames are written to ``folder``."""
+    """The motion that the policy follows; its frames are written to ``folder``."""
     if not isinstance(env, MotionTracking):
         return None
     save_clip(folder / MOTION_FILE, env.clips[0])
@@ -162,19 +162,20 @@ def _ends(env: RobotTask) -> Ends:
 
 
 def _gait(env: RobotTask) -> Gait:
-    """The clock that a row shows."""
+    """The gait clock of a row."""
     assert isinstance(env, LeggedRobot) and env.gait
     return Gait(env.cfg.gait.period, tuple(env.gait.offsets), env.cfg.rewards.min_command)
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
-    """A group's rows with what is known of how they are measured; a row that is a group itself is written out."""
+    """A group's rows, with how they are measured if that is known. A row that is a group gives its rows."""
     rows = []
     for row in env.observations.groups[group]:
         if row.group:
             if row.noise or row.history > 1 or any(scale != 1.0 for scale in row.column_scales()):
                 raise ExportError(
-                    f"observation row '{row.name}' of '{group}' is a group with its own noise, scale or history: give those to its rows"
+                    f"observation row '{row.name}' of '{group}' is a group with its own noise, scale or history: "
+                    "give those to its rows"
                 )
             rows += contract_rows(env, row.group, noise)
             continue
@@ -198,7 +199,7 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
 
 
 def write_terrain(env: RobotTask, task: LoadedTask, folder: Path) -> str:
-    """The scene among steps and blocks of the kinds that were trained, at three levels; or why there is none."""
+    """Write the scene with steps and blocks of the trained kinds, at three levels; returns why there is none, or ''."""
     ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind in LEVEL - {"flat"}]
     if not kinds:

@@ -1,6 +1,6 @@
-"""A trained policy to take away: network, contract and scene, compared with what was trained before anything is written.
+"""Exports a trained policy as network, contract and scene, after a comparison with the environment of its training.
 
-What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed to run them.
+``legged_mw.deploy.contract`` says what the files mean. Nothing here is needed to run them.
 """
 
 from __future__ import annotations
@@ -49,32 +49,33 @@ from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
 SOMETIMES = (TERRAIN_FILE, MOTORS_FILE, MOTION_FILE)
-ONCE = ("terrain.xml",)  # what older exports had
-WORLDS = 8  # of the roll-out that the export is tried on
-TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
+ONCE = ("terrain.xml",)  # files of older exports
+WORLDS = 8  # of the rollout for the comparison
+TOLERANCE = 1e-4  # of actions, relative above 1: float32 sums in another order
 
 
 class Exported(NamedTuple):
-    """What an export made."""
+    """The result of an export."""
 
     files: tuple[str, ...]
     gap: float  # largest difference of an action to the trained policy's
-    observations: int  # that it was tried on
-    # observation rows without a statement of how to measure them: the export cannot be deployed
+    observations: int  # in the comparison
+    # observation rows that nothing says how to measure: the export cannot be deployed
     unknown: tuple[str, ...]
-    no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
-    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training and cannot end a walk
+    no_terrain: str = ""  # why there is no scene with the steps of training, or ''
+    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes, and do not end a walk
     half: bool = False  # the weights are rounded to float16
 
     def text(self, folder: Path) -> str:
-        """What was written, in a line, and what stands in the way of its use."""
+        """A line on the files, and a line for each obstacle to their use."""
         rounded = ", its weights rounded to half precision" if self.half else ""
         lines = [f"written to {shown(folder)}: {', '.join(self.files)}{rounded}"]
         lines[0] += f"; actions differ from the trained policy's by {self.gap:.0e} at most"
         if self.unknown:
             names = ", ".join(self.unknown)
             lines.append(
-                f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)"
+                f"nothing says how to measure {names}: "
+                "legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)"
             )
         if self.not_covered:
             names = ", ".join(self.not_covered)
@@ -89,13 +90,13 @@ class Exported(NamedTuple):
 def export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> Exported:
     """Write the policy in ``checkpoint``, of the task as it was ``trained``, to ``folder``: all files, or none.
 
-    ``half``: round its weights to float16 first, and store them so: half the size. What is tried is the rounded policy.
-    Raises ExportError, ContractError, ConfigError or ModelError; an earlier export in the folder stays as it was then.
+    ``half``: round the weights to float16 and store them so; the rounded policy is compared. Raises ExportError,
+    ContractError, ConfigError or ModelError; then an earlier export in the folder stays.
     """
     precision = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")  # training may have set less, and some CPUs follow it
+    torch.set_float32_matmul_precision("highest")  # training may have set a lower one, which some CPUs follow
     try:
-        with torch.random.fork_rng(devices=[]):  # the roll-out must not change the caller's draws
+        with torch.random.fork_rng(devices=[]):  # the rollout must not change the caller's random numbers
             torch.default_generator.manual_seed(0)
             return _export(trained, checkpoint, folder, half)
     finally:
@@ -138,20 +139,20 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
             gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         if all(row.measured for row in contract.rows):
-            read_contract(new)  # as every reader will
+            read_contract(new)  # raises if a reader would
         files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
     return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered, half)
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
-    """The task as trained, kicks and pushes too, but small, on a CPU, and without slopes and what stands between a robot and its policy."""
+    """The task as trained, with kicks and pushes, but small, on a CPU, without slopes, noise and delays."""
     settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
     settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay", "slope")}
     if hasattr(task.cfg, "motion"):
-        settings["motion.clips"] = task.cfg.motion.clips[:1]  # that a deployed robot follows
+        settings["motion.clips"] = task.cfg.motion.clips[:1]  # the clip that a deployed robot follows
     if hasattr(task.cfg.terrain, "mesh_type"):
-        settings["terrain.mesh_type"] = "plane"  # the scene is the robot's alone
+        settings["terrain.mesh_type"] = "plane"  # the scene holds the robot alone
     for path, value in settings.items():
         task.set(path, value, where="export")
     return task.env_class(task.cfg, "cpu", eager=True)
@@ -160,7 +161,7 @@ def _small_env(task: LoadedTask) -> RobotTask:
 def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> None:
     try:
         save_onnx(policy, clip, path)
-    except Exception as error:  # the exporter's own, one for each thing that a network may do and it may not
+    except Exception as error:  # torch's exporter raises many kinds
         first = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
     if half:
@@ -168,7 +169,7 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
 
 
 def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.ndarray]:
-    """What an exported network should give: actions, and its memory or its estimate if there is one."""
+    """The right outputs of an exported network: actions, and memory or estimate if there is one."""
     with torch.inference_mode():
         outputs = ExportedPolicy(policy, clip)(*(torch.from_numpy(values) for values in inputs if values is not None))
     return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
@@ -184,12 +185,12 @@ def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
 
 
 def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
-    """The largest difference; refuses a network that acts or estimates otherwise than the policy."""
+    """The largest difference. Raises ExportError if the network acts or estimates otherwise than the policy."""
     gap = _gap(got, wanted)
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
-            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
-            f"(at most {TOLERANCE:g} is allowed); nothing was written"
+            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on "
+            f"{len(wanted)} recorded observations (at most {TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
 
@@ -199,19 +200,19 @@ def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
 
 @contextmanager
 def _all_or_nothing(folder: Path) -> Iterator[Path]:
-    """A temporary folder in ``folder``; once all files are in it a rename makes them the export: a kill after that leaves it to finish."""
+    """A temporary folder. One rename makes its files the export; a later program finishes a killed move."""
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder} is a file; name a folder to export to")
     new, mine = folder / f".export.{os.getpid()}.tmp", [part for part in (folder, *folder.parents) if not part.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(new, ignore_errors=True)  # of a process that had this one's number
+        shutil.rmtree(new, ignore_errors=True)  # of an earlier process with the same number
         new.mkdir()
         finish_moving(folder)  # of an export that was killed before
         sweep(folder)
         yield new
         for name in (*FILES, *SOMETIMES, *ONCE):
-            (new / name).touch()  # empty: one of an earlier export, which would be another policy's
+            (new / name).touch()  # an empty file deletes that of an earlier export
             flush(new / name)
         flush(new)
         os.replace(new, folder / STAGED)
@@ -221,5 +222,5 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(new, ignore_errors=True)
         with suppress(OSError):
-            for part in mine:  # those that are empty: nothing was written
+            for part in mine:  # empty folders, if nothing was written
                 part.rmdir()

@@ -1,4 +1,4 @@
-"""A policy's network as an ONNX file: writing it, halving it, running it."""
+"""A policy's network as an ONNX file: written, stored at half precision, run."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ExportedPolicy(nn.Module):
 def run_onnx(
     path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None
 ) -> np.ndarray:
-    """Actions (B, A), or another output, of the network in an ONNX file, by onnxruntime or where it is not installed onnx's evaluator."""
+    """Actions (B, A), or another output, of an ONNX file, by onnxruntime, or onnx's evaluator without it."""
     inputs = {INPUT: observations} | ({} if memory is None else {MEMORY_INPUT: memory})
     try:
         import onnxruntime
@@ -60,10 +60,10 @@ def run_onnx(
 
 
 def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A); see ``ExportedPolicy``."""
+    """Write one self-contained ONNX file, with ``obs`` (batch, size) as input and ``actions`` (batch, A) as output."""
     exported = ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
+        warnings.simplefilter("ignore")  # torch's exporter warns of its internals, and of missing torchvision
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             exported,
@@ -81,7 +81,7 @@ def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
 
 
 def _strip(path: Path) -> None:
-    """Drop what the exporter notes for debugging: stack traces, with the folders of the machine that it ran on."""
+    """Drop the exporter's notes for debugging: stack traces, with folders of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -93,7 +93,7 @@ def _strip(path: Path) -> None:
     for value in (*graph.input, *graph.output, *graph.value_info):
         for dim in value.type.tensor_type.shape.dim:
             if dim.dim_param:
-                dim.dim_param = "batch"  # the one free dimension, which the exporter names as it likes
+                dim.dim_param = "batch"  # the one free dimension, of any name
     onnx.save(model, path)
 
 
@@ -101,7 +101,7 @@ def _strip(path: Path) -> None:
 
 
 def _weights(policy: MLPModel) -> dict[str, nn.Parameter]:
-    """What is stored at half precision. Biases and the normalizer stay float32: they are few, and rounding them costs more."""
+    """The parameters stored at half precision. Biases and the normaliser stay float32: few, and rounding costs more."""
     return {name: parameter for name, parameter in policy.named_parameters() if parameter.dim() > 1}
 
 
@@ -112,7 +112,7 @@ def round_weights(policy: MLPModel) -> None:
 
 
 def halve(policy: MLPModel, path: Path) -> None:
-    """Store the weights of the rounded ``policy`` in ``path`` as float16, each with a Cast, so that all is computed in float32."""
+    """Store the weights of the rounded ``policy`` in ``path`` as float16, each with a Cast back to float32."""
     import onnx
     from onnx import numpy_helper
 

@@ -56,7 +56,7 @@ class RobotTaskCfgPPO(Config):
         wandb_project: str = "legged_mw"
         export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
         # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs
-        # learn and act in bfloat16, on a CPU too, and what else there is (memory, estimator, concurrent student, other
+        # learn and act in bfloat16, on a CPU too, and everything else (memory, estimator, concurrent student, other
         # activations) in TF32
         matmul_precision: Literal["highest", "high", "bf16"] = "high"
 
@@ -130,7 +130,7 @@ class RobotTaskCfgPPO(Config):
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
     class distillation:
-        """Replaces `algorithm` if there is a teacher, which the actor learns to imitate. rsl-rl's keys, from class_name."""
+        """Replaces `algorithm` if there is a teacher, which the actor imitates. From class_name on rsl-rl's keys."""
 
         # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
         teacher: str = ""

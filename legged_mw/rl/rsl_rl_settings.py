@@ -250,7 +250,7 @@ def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tu
 
     Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024.
 
-    ``obs`` may hold any of the environment's groups. It asks the host nothing, so that a CUDA graph can record it; look
+    ``obs`` may hold any of the environment's groups. A CUDA graph can record it: no read from the device. Look
     at ``env.mirror`` before recording, as its first use makes tensors.
     """
     table = env.mirror

@@ -417,7 +417,7 @@ def _stop_on_signals(runner: Runner) -> None:
     A second hang-up does nothing: when a terminal closes, the shell and the system send one each.
     """
 
-    def ask(number: int, _: object) -> None:
+    def stop(number: int, _: object) -> None:
         runner.stop = name = signal.Signals(number).name
         # os.write: print must not be called while another print is interrupted
         with suppress(OSError):  # the terminal may be gone
@@ -425,7 +425,7 @@ def _stop_on_signals(runner: Runner) -> None:
             os.write(1, f"{name}: saving and stopping after this iteration{again}\n".encode())
         signal.signal(number, (lambda *_: None) if name == "SIGHUP" else signal.SIG_DFL)
 
-    signal.signal(signal.SIGINT, ask)
-    signal.signal(signal.SIGTERM, ask)
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
-        signal.signal(signal.SIGHUP, ask)
+        signal.signal(signal.SIGHUP, stop)
