@@ -93,8 +93,8 @@ def play() -> None:
     """Watch, grade or export a policy."""
     start_quickly()
     from legged_mw.eval import grading
-    from legged_mw.rl.classes import check_classes
     from legged_mw.rl.policies import find_policy, find_rival, introduce, load_trained
+    from legged_mw.rl.rsl_rl_settings import check_classes
     from legged_mw.view import playing
 
     args = playing.parse(play.__doc__)
@@ -135,7 +135,7 @@ def grade_export(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
-    from legged_mw.rl.export import export  # onnx takes a while to import
+    from legged_mw.export.exporter import export  # onnx takes a while to import
 
     return export(task, checkpoint, folder, half).text(folder)
 

@@ -15,7 +15,7 @@ import torch
 
 from legged_mw import programs
 from legged_mw.eval import grading
-from legged_mw.rl import policies, runs
+from legged_mw.rl import policies, run_folder
 from legged_mw.rl.runner import Runner
 from legged_mw.view import launch
 
@@ -61,7 +61,7 @@ def run(program: str, root: Path, *args: str) -> Result:
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", [f"{program}.py", *args])
-        patch.setattr(runs, "logs_folder", lambda: root / "logs")
+        patch.setattr(run_folder, "logs_folder", lambda: root / "logs")
         patch.setattr(policies, "ROOT", root)  # no policy ships there
         try:
             programs.PROGRAMS[program]()

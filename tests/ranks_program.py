@@ -16,10 +16,9 @@ from pathlib import Path
 import torch
 from learner import parameters
 
-from legged_mw.rl.plan import Plan
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import leave_together, this_rank
-from legged_mw.rl.runner import make_runner
+from legged_mw.rl.runner import TrainingSchedule, make_runner
 from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.task import load_task
 
@@ -44,13 +43,16 @@ runner = make_runner(env, task.train, folder if rank.leads else None, device)
 assert isinstance(runner.alg, GraphedPPO)
 act, steps, done = runner.alg.act, 0, []
 # the first rank's clock counts: by the other's own the training is nearly over
-runner.deadline, runner.plan = time.time() + (1e6 if rank.leads else 1.0), Plan(used=0.0 if rank.leads else 9.0)
+runner.deadline, runner.schedule = (
+    time.time() + (1e6 if rank.leads else 1.0),
+    TrainingSchedule(used=0.0 if rank.leads else 9.0),
+)
 
 
 def mortal_act(obs: object) -> torch.Tensor:
     global steps
     steps += 1
-    done.append(runner.plan.done)
+    done.append(runner.schedule.done)
     if rank.index == 1 and steps > 12 * dies_in > 0:
         os._exit(3)
     return act(obs)  # type: ignore[arg-type]

@@ -33,6 +33,7 @@ TOOLS = (
     "legged_mw.view",
     "legged_mw.eval",
     "legged_mw.deploy",
+    "legged_mw.export",
     "legged_mw.robot",
     "legged_mw.drawing",
     "legged_mw.motion",
@@ -46,12 +47,12 @@ ONLY_IN = {
     "legged_mw.fast": ["legged_mw/fast/*"],
     "legged_mw.rl.students": [
         "legged_mw/rl/students/*",
-        "legged_mw/rl/export*.py",
+        "legged_mw/export/*",
         "legged_mw/eval/*",
         "legged_mw/view/*",
         "legged_mw/check/*",
     ],
-    "rsl_rl": ["legged_mw/rl/*"],
+    "rsl_rl": ["legged_mw/rl/*", "legged_mw/export/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     # a second to import, and only for a report
     "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],
@@ -71,11 +72,11 @@ ONLY_IN = {
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/fast/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
     # the reader of strangers' XML: an export's scene is one, and deploy runs without torch
-    "legged_mw.robot.mjcf": ["legged_mw/robot/*", "legged_mw/deploy/*", "legged_mw/rl/export*.py"],
+    "legged_mw.robot.mjcf": ["legged_mw/robot/*", "legged_mw/deploy/*", "legged_mw/export/*"],
     "legged_mw.drawing": [
         "legged_mw/drawing/*",
         "legged_mw/view/env_stage.py",
-        "legged_mw/rl/export_scene.py",
+        "legged_mw/export/scene.py",
         "legged_mw/eval/strip.py",
         "legged_mw/robot/picture.py",
         "legged_mw/motion/look.py",
@@ -85,12 +86,12 @@ ONLY_IN = {
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.tools": ["legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.deploy": [
-        *("legged_mw/deploy/*", "legged_mw/unitree/*", "legged_mw/rl/export*.py", "legged_mw/programs.py"),
+        *("legged_mw/deploy/*", "legged_mw/unitree/*", "legged_mw/export/*", "legged_mw/programs.py"),
         "examples/udp_robot.py",
     ],
-    "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
+    "legged_mw.export": ["legged_mw/export/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py"],
-    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/network.py"],
+    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/export/network.py"],
     "cyclonedds": ["legged_mw/unitree/idl.py", "legged_mw/unitree/link.py"],
     "configs": ["configs/*", "examples/*"],
     "train": [],
@@ -181,17 +182,15 @@ def within(name: str, package: str) -> bool:
 
 
 def layer(name: str) -> int:
-    """Place of a module of the core in ``LAYERS``; -1 for all others. Exports are a tool."""
-    head, _, rest = name.removeprefix("legged_mw.").partition(".")
-    return (
-        LAYERS.index(head) if name.startswith("legged_mw.") and head in LAYERS and not rest.startswith("export") else -1
-    )
+    """Place of a module of the core in ``LAYERS``; -1 for all others."""
+    head = name.removeprefix("legged_mw.").partition(".")[0]
+    return LAYERS.index(head) if name.startswith("legged_mw.") and head in LAYERS else -1
 
 
 def against_the_layers(path: str, name: str) -> bool:
     """Whether ``path`` is of the core and imports a tool, or what stands above it."""
     here = layer(path.removesuffix(".py").replace("/", "."))
-    tool = any(within(name, package) for package in TOOLS) or name.startswith("legged_mw.rl.export")
+    tool = any(within(name, package) for package in TOOLS)
     return here >= 0 and (tool or layer(name) > here)
 
 
@@ -303,12 +302,12 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/sim/model.py", "from legged_mw.envs.mirror import Mirror", True),
         ("legged_mw/sim/model.py", "def f():\n    from legged_mw.robot.vendor import read_robot", False),
         ("legged_mw/sim/joints.py", "from legged_mw.robot.vendor import read_robot", True),
-        ("legged_mw/envs/mirror.py", "from legged_mw.rl.symmetry import Mirrored", True),
+        ("legged_mw/envs/mirror.py", "from legged_mw.rl.rsl_rl_settings import Mirrored", True),
         ("legged_mw/envs/legged_robot_config.py", "from legged_mw.rl.learner_config import RobotTaskCfgPPO", True),
-        ("legged_mw/rl/symmetry.py", "from legged_mw.envs.mirror import Mirror", False),
-        ("legged_mw/rl/runner.py", "from legged_mw.rl.export import export", True),
-        ("legged_mw/rl/runner.py", "from legged_mw.rl.export_scene import standalone", True),
-        ("legged_mw/rl/export.py", "from legged_mw.rl.export_scene import standalone", False),
+        ("legged_mw/rl/rsl_rl_settings.py", "from legged_mw.envs.mirror import Mirror", False),
+        ("legged_mw/rl/runner.py", "from legged_mw.export.exporter import export", True),
+        ("legged_mw/rl/runner.py", "from legged_mw.export.scene import standalone", True),
+        ("legged_mw/export/exporter.py", "from legged_mw.export.scene import standalone", False),
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.view.stage import Stage", True),
         ("legged_mw/rl/training.py", "from legged_mw.robot.measure import measure", True),
         ("legged_mw/check/describe.py", "from legged_mw.robot.measure import measure", True),
@@ -322,8 +321,9 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/sim/graph.py", "if TYPE_CHECKING:\n    import legged_mw.envs", True),
         ("legged_mw/rl/ppo.py", "from legged_mw.rl.students.recurrent import HiddenState", True),
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.rl.students import estimator", True),
-        ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.recorded import RememberingModel", False),
+        ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.ppo import RememberingModel", False),
         ("legged_mw/eval/rollout.py", "from legged_mw.rl.students.recurrent import forget", False),
+        ("legged_mw/export/exporter.py", "from legged_mw.rl.students.recurrent import states_of", False),
         ("legged_mw/rl/runner.py", "import rsl_rl.runners", False),
         ("legged_mw/rl/runner.py", "from configs.go1_flat import TASK", True),
         ("configs/go1_rough.py", "from configs.go1_flat import Go1FlatCfg", False),
@@ -345,15 +345,15 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/unitree/client.py", "def f():\n    from cyclonedds.domain import Domain", True),
         ("legged_mw/unitree/link.py", "from cyclonedds.domain import Domain", False),
         ("legged_mw/deploy/runner.py", "import socket\nimport numpy as np\nimport mujoco", False),
-        ("legged_mw/rl/export.py", "from legged_mw.deploy.contract import Contract", False),
+        ("legged_mw/export/exporter.py", "from legged_mw.deploy.contract import Contract", False),
         ("legged_mw/rl/runner.py", "from legged_mw.deploy.contract import Contract", True),
         ("train.py", "from rsl_rl.runners import OnPolicyRunner", True),
         ("play.py", "from rsl_rl.models import MLPModel", True),
         ("legged_mw/rl/training.py", "from legged_mw.eval.training import make_exam", True),
-        ("legged_mw/rl/training.py", "from legged_mw.rl.export import export", True),
+        ("legged_mw/rl/training.py", "from legged_mw.export.exporter import export", True),
         ("legged_mw/rl/training.py", "from legged_mw.check.guard import check_recordable", True),
         ("legged_mw/programs.py", "from legged_mw.check.guard import check_recordable", False),
-        ("legged_mw/programs.py", "from legged_mw.rl.export import export", False),
+        ("legged_mw/programs.py", "from legged_mw.export.exporter import export", False),
     ],
 )
 def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> None:
@@ -367,7 +367,7 @@ def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> No
         # the config's default, the table of classes that a config may name, and where an old run's class is now
         (
             "legged_mw.rl.students",
-            ["legged_mw/rl/classes.py", "legged_mw/rl/learner_config.py", "legged_mw/utils/renamed.py"],
+            ["legged_mw/rl/learner_config.py", "legged_mw/rl/rsl_rl_settings.py", "legged_mw/utils/renamed.py"],
         ),
     ],
 )
@@ -407,11 +407,11 @@ def test_circles_are_found(back: str) -> None:
 
 
 def package_of(name: str) -> str:
-    """The package of legged_mw that a module belongs to; "" for those beside the packages. What exports is one of its own."""
+    """The package of legged_mw that a module belongs to; "" for those beside the packages."""
     parts = name.split(".")
     if parts[0] != "legged_mw" or len(parts) < 3 or not (ROOT / "legged_mw" / parts[1]).is_dir():
         return ""
-    return "export" if name.startswith("legged_mw.rl.export") else parts[1]
+    return parts[1]
 
 
 def package_graph(sources: Mapping[str, str]) -> dict[str, set[str]]:

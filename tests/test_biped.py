@@ -24,8 +24,8 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import QUANTITIES, Measurement
 from legged_mw.envs.feet import GaitClock
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl import export as exporting
-from legged_mw.rl.export import ExportError, export
+from legged_mw.export import exporter as exporting
+from legged_mw.export.exporter import ExportError, export
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import load_task

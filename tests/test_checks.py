@@ -17,7 +17,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.check.own_class import LEGGED_GYM_METHODS, PAYS, WITHOUT, check_class
-from legged_mw.rl.health import Health
+from legged_mw.rl.iteration_log import FiniteCheck
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
@@ -453,7 +453,7 @@ def test_episodes_of_one_step_are_said_when_training_begins_and_after_two_iterat
 
 def test_episodes_of_one_step_are_said_once_after_a_resume_too() -> None:
     numbers = {"episodes": 8.0, "episode_length": 1.0, "fell": 8.0, "broken": 0.0}
-    health = Health([], [])
+    health = FiniteCheck([], [])
     assert [len(health.lengths(numbers)) for _ in range(3)] == [0, 1, 0]  # whatever the number of the iteration is
 
 

@@ -17,7 +17,7 @@ import torch
 from program import SMALL, Result, files, refused, run, trained
 
 from legged_mw import ROOT
-from legged_mw.rl.export import FILES
+from legged_mw.export.exporter import FILES
 from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.utils.cli import FEWER_WORLDS, duration, one_line_errors
 from legged_mw.utils.config import load_yaml

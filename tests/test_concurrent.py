@@ -22,11 +22,11 @@ from legged_mw.check.describe import describe
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.network import run_onnx
+from legged_mw.export.network import run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, taught_worlds
+from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, pick_teacher_worlds
 from legged_mw.rl.transfer import attach_teacher_observations, begin_with, load_teacher
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
@@ -113,11 +113,13 @@ def test_no_gradient_goes_astray() -> None:
             if each.grad is not None and each.grad.any()
         }
 
-    taught = actor.taught[:, 0]
-    assert reached(actor.learn(latent, actor.lesson(obs, worlds))[1]) == {"estimator"}
-    assert reached(actor.learn(latent, actor.lesson(obs, worlds))[0][taught].sum()) == {"mlp", "teacher"}
-    assert reached(actor.learn(latent, actor.lesson(obs, worlds))[0][~taught].sum()) == {"mlp"}
-    torch.testing.assert_close(actor.learn(latent, actor.lesson(obs, worlds))[0], actor.mlp(actor.rollout_latent(obs)))
+    taught = actor.teacher_worlds[:, 0]
+    assert reached(actor.learn(latent, actor.regression_batch(obs, worlds))[1]) == {"estimator"}
+    assert reached(actor.learn(latent, actor.regression_batch(obs, worlds))[0][taught].sum()) == {"mlp", "teacher"}
+    assert reached(actor.learn(latent, actor.regression_batch(obs, worlds))[0][~taught].sum()) == {"mlp"}
+    torch.testing.assert_close(
+        actor.learn(latent, actor.regression_batch(obs, worlds))[0], actor.mlp(actor.rollout_latent(obs))
+    )
 
 
 def test_the_regression_is_plain_torchs(double: None) -> None:
@@ -141,7 +143,7 @@ def test_the_regression_is_plain_torchs(double: None) -> None:
 def test_worlds_act_by_the_latent_that_is_theirs() -> None:
     actor = make(GraphedPPO, concurrent={}).actor
     obs = TensorDict({"state": torch.randn(WORLDS, 7), "privileged_state": torch.randn(WORLDS, 11)}, [WORLDS])
-    latent, own, taught = actor.rollout_latent(obs), actor.get_latent(obs), actor.taught[:, 0]
+    latent, own, taught = actor.rollout_latent(obs), actor.get_latent(obs), actor.teacher_worlds[:, 0]
     assert torch.equal(latent[:, :4], own[:, :4]) and torch.equal(latent[~taught], own[~taught])
     assert (latent[taught, 4:] != own[taught, 4:]).all()
     torch.testing.assert_close(latent[:, 4:].norm(dim=1), torch.ones(WORLDS))
@@ -163,19 +165,19 @@ def test_samples_are_learned_from_as_they_were_acted(settings: dict[str, Any]) -
     batch = alg._prepare(alg._order[: alg._share])
     worlds = batch.batch.observations["state"][:, 0].abs().long()
     assert len(worlds) == (2 if "symmetry_cfg" in settings else 1) * STEPS * WORLDS // 4
-    assert torch.equal(batch.lesson[2], alg.actor.taught[worlds])
+    assert torch.equal(batch.regression_batch[2], alg.actor.teacher_worlds[worlds])
     assert update(alg)["student"] > 0.0
 
 
 def test_every_part_of_the_worlds_has_teachers_and_students() -> None:
     """As many as asked, also of the columns of a terrain, which repeat with a period or lie side by side."""
-    taught = taught_worlds(4000, 0.75)[:, 0].double()
+    taught = pick_teacher_worlds(4000, 0.75)[:, 0].double()
     assert taught.mean().item() == pytest.approx(0.75, abs=2e-3)
     for period in (2, 4, 5, 8, 10, 20):
         grid = taught.view(-1, period)
         assert ((grid.mean(dim=0) - 0.75).abs() < 0.02).all()
         assert ((taught.view(period, -1).mean(dim=1) - 0.75).abs() < 0.02).all()
-    assert taught_worlds(8, 1.0).all()
+    assert pick_teacher_worlds(8, 1.0).all()
 
 
 def test_the_update_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,7 +200,7 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
     assert {"teacher.0._mean", "teacher.1.0.weight", "estimator.0.weight"} <= load(tmp_path / "model_2.pt")[
         "actor_state_dict"
     ].keys()
-    assert resumed.alg.get_policy().get_buffer("taught").sum() == 13
+    assert resumed.alg.get_policy().get_buffer("teacher_worlds").sum() == 13
 
 
 # ---- what the config asks for

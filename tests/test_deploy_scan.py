@@ -20,7 +20,7 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.seal import sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.rl.export_scene import among_steps
+from legged_mw.export.scene import among_steps
 from legged_mw.robot.mjcf import MOST_BYTES, Source, write_archive
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain

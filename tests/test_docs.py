@@ -19,7 +19,7 @@ from legged_mw.check import guard
 from legged_mw.deploy.__main__ import main as deploy
 from legged_mw.deploy.__main__ import parse as parse_deploy
 from legged_mw.motion.__main__ import main as motion
-from legged_mw.rl import flags, runs
+from legged_mw.rl import flags, run_folder
 from legged_mw.sim import terrain
 from legged_mw.view import playing
 
@@ -108,7 +108,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOME", str(folder))
         patch.chdir(folder)
-        patch.setattr(runs, "logs_folder", lambda: folder / "logs")
+        patch.setattr(run_folder, "logs_folder", lambda: folder / "logs")
         yield folder
 
 

@@ -31,11 +31,11 @@ from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Record, holding, roll_out
 from legged_mw.eval.rules import ExamRules
 from legged_mw.eval.training import training_figures
-from legged_mw.rl.network import ESTIMATE, ExportedPolicy, run_onnx
-from legged_mw.rl.policies import act, find_trained, load_policy
+from legged_mw.export.network import ExportedPolicy, run_onnx
+from legged_mw.rl.policies import ESTIMATE, act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.students.estimator import SMALLEST, EstimatingModel
 from legged_mw.rl.transfer import begin_with
 from legged_mw.utils.config import ConfigError, load_yaml

@@ -25,11 +25,12 @@ from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl import export as exporting
-from legged_mw.rl.classes import actor_settings, network_section
-from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
-from legged_mw.rl.export_replay import overridden, own_ends
-from legged_mw.rl.export_scene import differences, standalone
+from legged_mw.export import exporter as exporting
+from legged_mw.export.contract import contract_rows
+from legged_mw.export.exporter import FILES, Exported, ExportError, export
+from legged_mw.export.replay import overridden, own_ends
+from legged_mw.export.scene import differences, standalone
+from legged_mw.rl.rsl_rl_settings import actor_settings, network_section
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import load_yaml

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged_mw.rl.export_meshes import shorten
+from legged_mw.export.scene import shorten
 
 ROOT = Path(__file__).parents[1]
 SOURCE = """<mujoco><asset>

@@ -22,7 +22,7 @@ from legged_mw.check.guard import check_recordable
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.export import export
+from legged_mw.export.exporter import export
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.sim.sensors import ANGULAR_MOMENTUM, CONTACT_FORCE, SELF_CONTACT, SENSORS

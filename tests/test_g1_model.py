@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from inertia import compiled_tensor, rotation, tensor
 
-from legged_mw.rl.export_scene import standalone
+from legged_mw.export.scene import standalone
 from legged_mw.sim.model import Ground, Solver, build_model
 
 XML = Path(__file__).parents[1] / "resources" / "robots" / "g1" / "g1.xml"

@@ -540,7 +540,7 @@ def test_a_replayed_update_is_undone_to_the_last_bit() -> None:
             alg.storage.rewards[1, 2] = math.nan
             alg.compute_returns(alg.storage.observations[-1])
         alg.update()
-        assert bool(alg.undo.undone) == (seed in (0, 4)) == (difference(before, parameters(alg)) == 0.0)
+        assert bool(alg.rollback.undone) == (seed in (0, 4)) == (difference(before, parameters(alg)) == 0.0)
     assert alg._update_graph.recorded
     assert all(bool(value.isfinite().all()) for memory in alg.optimizer.state.values() for value in memory.values())
 
@@ -557,7 +557,7 @@ def test_a_run_goes_on_in_the_worlds_that_it_left(tmp_path: Path) -> None:
     again = make_runner(other, task.train, None, DEVICE)
     again.load(str(tmp_path / "model_6.pt"))
     restored = take_snapshot(other)
-    assert again.begins_anew == "" and all(
+    assert again.why_not_exact == "" and all(
         torch.equal(restored[name].nan_to_num(), value.nan_to_num()) for name, value in kept.items()
     )
     again.learn(5, init_at_random_ep_len=False)

@@ -23,13 +23,13 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import crossing
 from legged_mw.eval.exam import OVERRIDES
 from legged_mw.eval.rollout import holding, roll_out
-from legged_mw.rl import export_replay
-from legged_mw.rl.export import ExportError, export
+from legged_mw.export import replay as export_replay
+from legged_mw.export.exporter import ExportError, export
 from legged_mw.rl.learner_config import fit_cpu
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.students.recurrent import forget, memory_of
 from legged_mw.rl.training import advice_on_rate
 from legged_mw.utils.config import ConfigError

@@ -24,8 +24,8 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motors import SubstepDelay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.snapshot import put_snapshot, take_snapshot
-from legged_mw.rl import export as exporting
-from legged_mw.rl.export import export
+from legged_mw.export import exporter as exporting
+from legged_mw.export.exporter import export
 from legged_mw.rl.runner import make_runner
 from legged_mw.robot import actuator_net
 from legged_mw.utils.config import load_yaml, save_yaml

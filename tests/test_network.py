@@ -18,9 +18,9 @@ from worlds import make_env
 from legged_mw import ROOT
 from legged_mw.deploy import contract
 from legged_mw.deploy.stage import DeployStage
+from legged_mw.export.exporter import Exported, export
+from legged_mw.export.network import run_onnx, save_onnx
 from legged_mw.rl import policies
-from legged_mw.rl.export import Exported, export
-from legged_mw.rl.network import run_onnx, save_onnx
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml

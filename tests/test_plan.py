@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl import plan as planning
-from legged_mw.rl.plan import Plan
-from legged_mw.rl.runner import Runner, make_runner
+from legged_mw.rl import runner as planning
+from legged_mw.rl.runner import Runner, TrainingSchedule, make_runner
 from legged_mw.utils.task import LoadedTask, load_task
 
 
@@ -23,7 +22,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def follow(
-    plan: Plan, clock: list[float], seconds: dict[int, float], pace: float, begin: int = 0, late: int = 0
+    plan: TrainingSchedule, clock: list[float], seconds: dict[int, float], pace: float, begin: int = 0, late: int = 0
 ) -> list[float]:
     """What is done in each iteration, of ``pace`` seconds or what ``seconds`` says of the n-th; heard of so many iterations ``late``."""
     done, iteration, estimates = [], begin, []
@@ -31,18 +30,20 @@ def follow(
         done.append(plan.begin(iteration))
         iteration += 1
         clock[0] += seconds.get(len(done), pace)
-        estimates.append((iteration, plan.room()))
+        estimates.append((iteration, plan.iterations_left()))
         if len(estimates) > late:
-            plan.hear(*estimates[-1 - late])
+            plan.end_after(*estimates[-1 - late])
     return done
 
 
 def test_without_a_deadline_iterations_count(clock: list[float]) -> None:
-    plan = Plan(5)
+    plan = TrainingSchedule(5)
     assert follow(plan, clock, {}, 3.0) == [0.0, 0.25, 0.5, 0.75, 1.0]
     assert plan.last == 5 and plan.saved() == {}
-    assert follow(Plan(5), clock, {}, 3.0, begin=3) == [0.75, 1.0], "a resumed one is where it would have been"
-    assert follow(Plan(1), clock, {}, 3.0) == [0.0]
+    assert follow(TrainingSchedule(5), clock, {}, 3.0, begin=3) == [0.75, 1.0], (
+        "a resumed one is where it would have been"
+    )
+    assert follow(TrainingSchedule(1), clock, {}, 3.0) == [0.0]
 
 
 @pytest.mark.parametrize("late", [0, 1])
@@ -61,7 +62,7 @@ def test_without_a_deadline_iterations_count(clock: list[float]) -> None:
 def test_the_last_iteration_that_the_time_has_room_for_is_annealed(
     clock: list[float], seconds: dict[int, float], late: int
 ) -> None:
-    plan = Plan(10**6, clock[0] + 60.0)
+    plan = TrainingSchedule(10**6, clock[0] + 60.0)
     done = follow(plan, clock, seconds, 0.1, late=late)
     assert done[0] == 0.0 and done[-1] == 1.0
     assert all(a <= b for a, b in pairwise(done)), "it never falls"
@@ -70,7 +71,7 @@ def test_the_last_iteration_that_the_time_has_room_for_is_annealed(
 
 
 def test_even_iterations_are_even_steps(clock: list[float]) -> None:
-    done = follow(Plan(10**6, clock[0] + 10.0), clock, {}, 0.1)
+    done = follow(TrainingSchedule(10**6, clock[0] + 10.0), clock, {}, 0.1)
     steps = [after - before for before, after in pairwise(done[1:])]
     assert len(done) == 100 and steps == pytest.approx([1 / 98] * 98, rel=1e-3), (
         "after the first, whose time says nothing yet"
@@ -79,24 +80,24 @@ def test_even_iterations_are_even_steps(clock: list[float]) -> None:
 
 def test_a_stall_before_the_end_is_no_jump_back(clock: list[float]) -> None:
     """The time is over before the next iteration: it stays where it was, nearly at the end."""
-    done = follow(Plan(10**6, clock[0] + 10.0), clock, {98: 5.0}, 0.1)
+    done = follow(TrainingSchedule(10**6, clock[0] + 10.0), clock, {98: 5.0}, 0.1)
     assert len(done) == 98 and 0.97 < done[-1] <= 1.0
 
 
 def test_iterations_may_end_first(clock: list[float]) -> None:
-    plan = Plan(11, clock[0] + 1000.0)
+    plan = TrainingSchedule(11, clock[0] + 1000.0)
     assert follow(plan, clock, {}, 1.0) == pytest.approx([i / 10 for i in range(11)]) and plan.last == 11
 
 
 def test_a_deadline_that_is_over_lets_one_iteration_be(clock: list[float]) -> None:
-    assert follow(Plan(100, clock[0] - 5.0), clock, {}, 1.0) == [0.0]
+    assert follow(TrainingSchedule(100, clock[0] - 5.0), clock, {}, 1.0) == [0.0]
 
 
 def test_time_before_counts(clock: list[float]) -> None:
     """Stopped half way and resumed with what was left, or asked for as much again after its end: it is half done."""
-    done = follow(Plan(10**6, clock[0] + 30.0, used=30.0), clock, {}, 0.1, begin=300)
+    done = follow(TrainingSchedule(10**6, clock[0] + 30.0, used=30.0), clock, {}, 0.1, begin=300)
     assert done[0] == 0.5 and done[-1] == 1.0 and all(a <= b for a, b in pairwise(done))
-    untimed = Plan(1000, used=30.0)
+    untimed = TrainingSchedule(1000, used=30.0)
     assert untimed.begin(300) == pytest.approx(300 / 999) and untimed.seconds >= 30.0, (
         "its iterations are its plan, its time is kept"
     )
@@ -138,9 +139,11 @@ def test_a_training_of_a_given_time_ends_annealed_and_goes_on(clock: list[float]
     runner, seen = timed(small(), clock, 5.0)
     kl, entropy, sigma = zip(*seen, strict=True)
     assert (kl[0], entropy[0], sigma[0]) == pytest.approx((0.01, 0.005, 0.2))
-    assert (kl[-1], entropy[-1], sigma[-1]) == pytest.approx((0.003, 0.001, 0.05)) and len(kl) == runner.plan.last == 5
+    assert (kl[-1], entropy[-1], sigma[-1]) == pytest.approx((0.003, 0.001, 0.05)) and len(
+        kl
+    ) == runner.schedule.last == 5
     assert list(kl) == sorted(kl, reverse=True) and runner.stop is None
     runner.save(str(tmp_path / "model_5.pt"))
     again, seen = timed(small(), clock, 5.0, tmp_path / "model_5.pt")
     assert seen[0][0] == pytest.approx(0.0065) and seen[-1][0] == pytest.approx(0.003), "five of ten seconds were over"
-    assert again.plan.saved() == {"seconds": 10.0} and again.current_learning_iteration == 10
+    assert again.schedule.saved() == {"seconds": 10.0} and again.current_learning_iteration == 10

@@ -14,7 +14,7 @@ from rsl_rl.models import MLPModel
 
 from legged_mw.rl.layers import Linear
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.settings import rsl_rl_config
+from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 

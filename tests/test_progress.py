@@ -12,8 +12,8 @@ import pytest
 from program import SMALL, run
 
 from legged_mw.eval import training
-from legged_mw.rl import progress
-from legged_mw.rl.progress import LOG_FILE, Console
+from legged_mw.rl import iteration_log
+from legged_mw.rl.iteration_log import LOG_FILE, Console
 
 NUMBERS = {"reward": 1.234, "episode_length": math.nan, "fell": 2.0, "episodes": 7.0}
 
@@ -42,7 +42,7 @@ def shown(text: str) -> list[str]:
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time, to be set [s]."""
     now = [1000.0]
-    monkeypatch.setattr(progress.time, "time", lambda: now[0])
+    monkeypatch.setattr(iteration_log.time, "time", lambda: now[0])
     return now
 
 

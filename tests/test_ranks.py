@@ -15,7 +15,7 @@ from learner import difference
 
 from legged_mw import ROOT
 from legged_mw.rl.ranks import Rank, rank_device, this_rank
-from legged_mw.rl.runs import checkpoints
+from legged_mw.rl.run_folder import checkpoints
 from legged_mw.utils.config import ConfigError, load_yaml
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]

@@ -20,8 +20,8 @@ from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval import exam, rules
-from legged_mw.rl.export import FILES
-from legged_mw.rl.network import ExportedPolicy
+from legged_mw.export.exporter import FILES
+from legged_mw.export.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import load_yaml

@@ -26,11 +26,11 @@ from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.rl import export as exporting
-from legged_mw.rl.export import Exported, export
+from legged_mw.export import exporter as exporting
+from legged_mw.export.exporter import Exported, export
 from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.rsl_rl_settings import mirror
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.symmetry import mirror
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import LoadedTask, load_task, task_names

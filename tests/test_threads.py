@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from legged_mw.rl import threads
-from legged_mw.rl.threads import ThreadChoice, UpdateThreads, better
+from legged_mw.rl import runner
+from legged_mw.rl.runner import ThreadChoice, UpdateThreads, better
 
 IDLE, BUSY = {1: 0.09, 2: 0.06}, {1: 0.16, 2: 5.0}  # [s] an update
 
@@ -78,7 +78,7 @@ def test_torch_gets_the_threads_and_the_user_the_line(
 ) -> None:
     """A number that is asked for is never tried; what fails is no measurement; torch has its own number back in any case."""
     clock, before = [0.0], torch.get_num_threads()
-    monkeypatch.setattr(threads.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(runner.time, "perf_counter", lambda: clock[0])
 
     def spend(around: UpdateThreads, seconds: Callable[[int], float]) -> int:
         with around:

@@ -20,8 +20,8 @@ from torch.utils.tensorboard import SummaryWriter
 from legged_mw import ROOT, programs
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import training
+from legged_mw.rl.checkpoint import load_tensors, save_whole
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, compare, completion, doctor, sweep, warm
 from legged_mw.tools.curves import read_run
@@ -564,7 +564,7 @@ NOT_TO_TRAIN = [
         "legged_mw.deploy",
         "legged_mw.robot.picture",
         "legged_mw.drawing",
-        "legged_mw.rl.export",
+        "legged_mw.export",
         "legged_mw.tools",
     ),
 ]

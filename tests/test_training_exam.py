@@ -17,8 +17,8 @@ from legged_mw.eval import training
 from legged_mw.eval.exams import make_exam
 from legged_mw.eval.rollout import Record
 from legged_mw.eval.training import TrainingExam, training_figures
+from legged_mw.rl.run_folder import checkpoints
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.task import load_task
 
 FIGURES = ["error_vx", "error_vy", "error_yaw", "falls", "pushes_survived"]

@@ -25,7 +25,7 @@ from legged_mw.drawing.scene import visual_model
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import start_place
-from legged_mw.rl.export_scene import standalone
+from legged_mw.export.scene import standalone
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import RobotModel, read_file
 from legged_mw.sim.robot_file import read_plain

@@ -38,7 +38,7 @@ WORDS = {
 }
 HOUSE: list[tuple[str, str, str, str]] = [  # of the core, from the top
     (GREY, "train.py  play.py", "main() of fifteen lines", "十几行的 main()"),
-    (PURPLE, "legged_mw/rl", "PPO, runner, runs, export", "PPO、训练循环、运行目录、导出"),
+    (PURPLE, "legged_mw/rl", "PPO, runner, run folders", "PPO、训练循环、运行目录"),
     (BLUE, "legged_mw/envs", "tasks: rewards, rows, commands", "任务：奖励、观测行、指令"),
     (GREEN, "legged_mw/sim", "model, two engines, graph", "模型、两个引擎、CUDA graph"),
     (GREY, "legged_mw/utils", "config rule, command line", "配置规则、命令行"),
@@ -46,7 +46,7 @@ HOUSE: list[tuple[str, str, str, str]] = [  # of the core, from the top
 TOOLS: list[tuple[str, str, str, str]] = [
     (ORANGE, "legged_mw/eval", "exams, report", "考试与报告"),
     (ORANGE, "legged_mw/view", "window, web page, video", "窗口、网页、视频"),
-    (ORANGE, "legged_mw/deploy", "a policy without torch", "脱离 torch 运行策略"),
+    (ORANGE, "legged_mw/export, deploy", "a policy without torch", "脱离 torch 运行策略"),
     (ORANGE, "legged_mw/robot, motion", "robots and clips in", "导入机器人与动作"),
 ]
 HOUSE_WORDS = {

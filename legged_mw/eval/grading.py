@@ -12,8 +12,8 @@ from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
 from legged_mw.eval.rules import in_common
-from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, introduce, load_policy
+from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError

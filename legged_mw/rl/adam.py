@@ -1,4 +1,4 @@
-"""Adam as a CUDA graph can record it, in one tensor, and its state as rsl-rl's own learners write it to a checkpoint."""
+"""Adam that a CUDA graph can record, with all parameters in one tensor, and its state in rsl-rl's form."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from legged_mw.rl.layers import kernels_for
 
-_ALIGNED = 64  # values: each parameter begins at a multiple, as fast matrix products want it
+_ALIGNED = 64  # values: fast matrix products want each parameter to begin at a multiple
 
 
 def make_recordable(optimizer: torch.optim.Optimizer, rates: Sequence[Tensor | float], device: str) -> None:
-    """Make Adam, new or as a file had it, one that can be recorded, with a learning rate for each of its groups."""
+    """Make an Adam, new or loaded, one that can be recorded, with a learning rate for each of its groups."""
     for group, rate in zip(optimizer.param_groups, rates, strict=True):
         group.update(lr=rate, fused=True, capturable=device.startswith("cuda"))
     for memory in optimizer.state.values():
@@ -22,7 +22,7 @@ def make_recordable(optimizer: torch.optim.Optimizer, rates: Sequence[Tensor | f
 
 
 def plain_state(state: dict[str, Any], rates: Sequence[float]) -> dict[str, Any]:
-    """The state of such an Adam in the form that rsl-rl's own learners write: a count of steps for each parameter."""
+    """The state of such an Adam in rsl-rl's form: a count of steps for each parameter."""
     plain = {"fused": None, "capturable": False}
     return {
         "state": {i: {**memory, "step": memory["step"].cpu().clone()} for i, memory in state["state"].items()},
@@ -33,15 +33,15 @@ def plain_state(state: dict[str, Any], rates: Sequence[float]) -> dict[str, Any]
 
 
 class FlatAdam:
-    """Clips and steps what ``part`` of an Adam's or AdamW's parameters learns together, in a tensor each for all of them.
+    """Clips and steps a ``part`` of the parameters of an Adam or AdamW, all of them in one tensor.
 
-    The parameters and Adam's memory become views of those tensors; the optimizer has the memory's state as ever.
+    Parameters and Adam's moments become views of flat tensors; the optimizer's state holds the views.
     """
 
     def __init__(
         self, optimizer: torch.optim.Optimizer, group: int, part: Sequence[nn.Parameter], limit: float
     ) -> None:
-        """``group``: the optimizer's that has the part; ``limit``: of the norm of its gradient."""
+        """``group``: the part's group in the optimizer; ``limit`` on the norm of its gradient."""
         self._optimizer, self._group, self._limit = optimizer, optimizer.param_groups[group], limit
         self._part = [parameter for parameter in part if parameter.requires_grad]
         first = self._part[0].detach()
@@ -65,13 +65,13 @@ class FlatAdam:
         return [piece.view_as(value) for piece, value in zip(flat.split(sizes)[::2], self._part, strict=True)]
 
     def gradient(self) -> Tensor | None:
-        """All of the part's gradients in one tensor; None if it has none."""
+        """The part's gradients in one tensor, or None."""
         if all(parameter.grad is None for parameter in self._part):
             return None
         return self._lay([torch.zeros_like(value) if value.grad is None else value.grad for value in self._part])
 
     def _take_over(self) -> None:
-        """The optimizer's memory, new or as a file had it, becomes views of ours."""
+        """Copy the optimizer's state, new or loaded, into the flat tensors, and make it views of them."""
         states = [self._optimizer.state[parameter] for parameter in self._part]
         if states[0].get("step") is self._step:
             return
@@ -85,7 +85,7 @@ class FlatAdam:
 
     @torch.no_grad()
     def step(self, gradient: Tensor) -> None:
-        """One step from ``gradient``, by the group's rate."""
+        """One step along ``gradient``, at the group's rate."""
         self._take_over()
         group, (mean, square), norm = self._group, self._memory, torch.linalg.vector_norm(gradient)
         rate, (beta1, beta2), eps, decay = (group[name] for name in ("lr", "betas", "eps", "weight_decay"))

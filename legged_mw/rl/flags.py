@@ -1,4 +1,4 @@
-"""The flags of train.py. Read before torch is imported: a mistake in them and --help answer at once."""
+"""The flags of train.py. They are read before torch is imported, so that --help and mistakes answer at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from legged_mw.utils.task import task_names
 
 
 def parse(description: str | None, argv: list[str] | None = None) -> argparse.Namespace:
-    """The flags of training: those that this program got, or ``argv``."""
+    """The flags of training, from ``argv`` or the command line."""
     parser = make_parser(description)
     parser.add_argument(
         "--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not"
@@ -53,9 +53,9 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
 
 
 def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Where ``--task`` is missing, take the one that the run at the path ``--load_run`` is of."""
+    """If ``--task`` is missing, take the task of the run at the path ``--load_run``."""
     if not args.task and args.load_run:
-        from legged_mw.rl.runs import task_at  # with torch
+        from legged_mw.rl.run_folder import task_at  # with torch
 
         args.task = task_at(args.load_run)
     if not args.task:

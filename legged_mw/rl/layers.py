@@ -13,15 +13,15 @@ from torch import Tensor, nn
 from legged_mw.utils.opaque import fast
 
 Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each
-FUSED_ON = ["cuda"]  # devices whose updates use the kernels of fast/kernels.py
-_SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
+FUSED_ON = ["cuda"]  # devices on which updates use fast/kernels.py
+_SUM_ROWS = 128  # rows that one thread sums; threads run side by side
 
 
 class Linear(torch.autograd.Function):
-    """``x W^T + b`` for many rows, faster than torch's own in two places.
+    """``x W^T + b`` for many rows, faster than torch's own in two ways.
 
-    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns than
-    the weight, of zeros: a multiple of four of them is what TF32 products want.
+    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns
+    than the weight, of zeros: a multiple of four of them is what TF32 products want.
     """
 
     @staticmethod
@@ -40,10 +40,10 @@ class Linear(torch.autograd.Function):
 
 
 def kernels_for(x: Tensor) -> Any:
-    """The module of kernels if ``x`` is where they are used, else None, as without legged_mw/fast."""
+    """The module fast/kernels.py if it is there and ``x`` is on a device that uses it, else None."""
     if x.device.type not in FUSED_ON:
         return None
-    return fast("kernels")  # with warp, a second to import, and only for a GPU
+    return fast("kernels")  # imports warp, which takes a second
 
 
 def sum_rows(x: Tensor) -> Tensor:
@@ -52,11 +52,11 @@ def sum_rows(x: Tensor) -> Tensor:
 
 
 class EluLayers(torch.autograd.Function):
-    """Linear layers with an ELU after each but the last, which reads and says float32.
+    """Linear layers with an ELU after each but the last, whose input and output are float32.
 
-    ``read``: weight and bias of each as the products read them: their own, or rounded to bfloat16, in which all before the last
-    is then computed; sums and the gradients of weights are float32 all the same. ``x`` and the first weight may have more columns,
-    of zeros.
+    ``read``: weight and bias of each as the products read them: their own, or rounded to bfloat16, in which all before
+    the last is then computed; sums and the gradients of weights are float32 all the same. ``x`` and the first weight
+    may have more columns, of zeros.
     """
 
     @staticmethod
@@ -88,7 +88,7 @@ class EluLayers(torch.autograd.Function):
 
 
 class EluBackward:
-    """Gradients before the ELUs of a network from those after them, and their sums over all rows: on a GPU in one kernel."""
+    """Gradients before the ELUs of a network from those after them, and their sums over rows; on a GPU one kernel."""
 
     def __init__(self, outs: list[Tensor]) -> None:
         """``outs``: (B, size) of each ELU."""
@@ -100,7 +100,7 @@ class EluBackward:
             self._table = outs[0].new_empty(-(-rows // self._kernels.ROWS), sum(sizes), dtype=torch.float32)
 
     def __call__(self, grad: Tensor, i: int) -> Tensor:
-        """The gradient (B, size) before ELU ``i``, of its output's type."""
+        """The gradient (B, size) before ELU ``i``, of the type of its output."""
         if self._table is not None:
             return self._kernels.elu_backward(
                 grad, self._outs[i], self._table, sum(out.shape[1] for out in self._outs[:i])
@@ -111,37 +111,44 @@ class EluBackward:
         return grad
 
     def sums(self) -> list[Tensor]:
-        """The sums (size,) by layer, float32 at least; once all are called."""
+        """The sums (size,) by layer, float32 at least. Call it after all layers."""
         if self._table is None:
             return self._sums
         return list(self._table.sum(dim=0).split([out.shape[1] for out in self._outs]))
 
 
 def _float_product(a: Tensor, b: Tensor) -> Tensor:
-    """``a @ b``, of bfloat16 in float32: it is summed so in any case."""
+    """``a @ b``; for bfloat16 the result is float32, in which the product sums anyway."""
     if a.dtype != torch.bfloat16:
         return a @ b
-    return torch.mm(a, b, out_dtype=torch.float32) if a.is_cuda else a.float() @ b.float()  # type: ignore[call-overload]
+    if a.is_cuda:
+        return torch.mm(a, b, out_dtype=torch.float32)  # type: ignore[call-overload]
+    return a.float() @ b.float()
 
 
 def elu_layers(layers: nn.Module) -> list[nn.Linear]:
-    """The linear layers of an rsl-rl MLP if ``EluLayers`` computes them, else none. Behind the last may stand what has no parameters."""
-    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]  # type: ignore[attr-defined]
-    between = [layer for layer in layers if not isinstance(layer, nn.Linear)][: len(linear) - 1]  # type: ignore[attr-defined]
+    """The linear layers of an rsl-rl MLP if ``EluLayers`` can compute them, else none.
+
+    Layers without parameters may follow the last one.
+    """
+    every: list[nn.Module] = [*layers]  # type: ignore[misc]
+    linear = [layer for layer in every if isinstance(layer, nn.Linear)]
+    between = [layer for layer in every if not isinstance(layer, nn.Linear)][: len(linear) - 1]
     order = [layer for pair in zip(linear, between, strict=False) for layer in pair] + linear[-1:]
-    fits = all(type(layer) is nn.ELU and layer.alpha == 1.0 for layer in between) and [*layers][: len(order)] == order  # type: ignore[misc]
+    fits = all(type(layer) is nn.ELU and layer.alpha == 1.0 for layer in between) and every[: len(order)] == order
     return linear if fits else []
 
 
 def run_mlp(layers: nn.Module, x: Tensor, read: Layers | None = None) -> Tensor:
-    """The output of an rsl-rl MLP for inputs (B, size); ``read``: what ``EluLayers`` reads in place of the weights."""
+    """The output of an rsl-rl MLP for inputs (B, size); ``read``: the weights for ``EluLayers``, if not its own."""
     rest = [*layers]  # type: ignore[misc]
     if linear := elu_layers(layers):
         with torch.no_grad():
             read = read or [
                 (_padded(layer.weight, x.shape[1] if layer is linear[0] else 0), layer.bias) for layer in linear
             ]
-        x = EluLayers.apply(x, read, *(value for layer in linear for value in (layer.weight, layer.bias)))  # type: ignore[assignment]
+        parameters = (value for layer in linear for value in (layer.weight, layer.bias))
+        x = EluLayers.apply(x, read, *parameters)  # type: ignore[assignment]
         rest = rest[2 * len(linear) - 1 :]
     for layer in rest:
         x = Linear.apply(x, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(x)  # type: ignore[misc]
@@ -153,9 +160,9 @@ def _padded(weight: Tensor, columns: int) -> Tensor:
 
 
 class HalfWeights:
-    """A network's weights as ``EluLayers`` reads them in bfloat16: copies of all but the last layer's."""
+    """A network's weights in bfloat16 for ``EluLayers``: copies of all but the last layer's."""
 
-    ALIGNED = 8  # columns: what products of bfloat16 want a multiple of
+    ALIGNED = 8  # products of bfloat16 want a multiple of so many columns
 
     def __init__(self, linear: list[nn.Linear]) -> None:
         hidden = linear[:-1]
@@ -171,19 +178,19 @@ class HalfWeights:
 
     @torch.no_grad()
     def read(self) -> Layers:
-        """The layers, rounded from what they are now."""
+        """The layers, rounded from their present weights."""
         self._copies[0].copy_(self._own[0])
         torch._foreach_copy_(self._copies[1:], self._own[1:])  # pyright: ignore[reportPrivateImportUsage]
         return self._layers
 
     @torch.no_grad()
     def prepare(self, latent: Tensor) -> Tensor:
-        """What the network reads (B, size), in bfloat16 and with columns of zeros."""
+        """The network's input (B, size), in bfloat16 and padded with columns of zeros."""
         return nn.functional.pad(latent.bfloat16(), (0, -latent.shape[1] % self.ALIGNED))
 
 
 def sample(model: MLPModel, output: Tensor) -> Tensor:
-    """Actions (N, A) drawn from a policy with a Gaussian, for its MLP's output; torch.normal would check the std on the host."""
+    """Actions (N, A) drawn from a Gaussian policy. torch.normal would read the std on the host."""
     assert model.distribution is not None
     model.distribution.update(output)  # the forward pass without its own sample
     mean = model.output_mean
@@ -191,12 +198,12 @@ def sample(model: MLPModel, output: Tensor) -> Tensor:
 
 
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:
-    """rsl-rl's running mean and variance over ``x`` (B, size), in place and without its copy from the host."""
+    """Update rsl-rl's running mean and variance with ``x`` (B, size), in place, without its copy from the host."""
     if not normalizer.training:
         return
     count = x.shape[0] * world_size
     var, mean = torch.var_mean(x, dim=0, unbiased=False, keepdim=True)
-    if world_size > 1:  # every rank brings as many samples
+    if world_size > 1:  # all ranks have the same number of samples
         own_mean = mean.clone()
         torch.distributed.all_reduce(mean)
         mean /= world_size

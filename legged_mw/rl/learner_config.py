@@ -1,6 +1,7 @@
-"""Every field of the learner, once, typed, with source. Tasks override these in configs/. No field of the environment is here.
+"""Every field of the learner, typed, with its source. Tasks override them in configs/. None is the environment's.
 
-Sources: [P] MuJoCo Playground's learner settings for its Go1 joystick task; [R] rsl-rl's defaults; [ours] with the reason.
+Sources: [P] MuJoCo Playground's learner settings for its Go1 joystick task; [R] rsl-rl's defaults; [ours] with the
+reason.
 """
 
 from __future__ import annotations
@@ -57,8 +58,9 @@ class RobotTaskCfgPPO(Config):
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
         wandb_project: str = "legged_mw"
         export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
-        # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs learn and act in
-        # bfloat16, on a CPU too, and what else there is (memory, estimator, concurrent student, other activations) in TF32
+        # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs
+        # learn and act in bfloat16, on a CPU too, and everything else (memory, estimator, concurrent student, other
+        # activations) in TF32
         matmul_precision: Literal["highest", "high", "bf16"] = "high"
 
     class obs_groups:
@@ -82,7 +84,7 @@ class RobotTaskCfgPPO(Config):
             std_range: PositiveRange = [1e-6, 1e6]  # [R]
 
         class estimator:
-            """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (students/estimator.py)."""
+            """A network that estimates rows which the actor does not read, for the actor (students/estimator.py)."""
 
             # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
             targets: list[str] = []
@@ -91,7 +93,7 @@ class RobotTaskCfgPPO(Config):
             learning_rate: PositiveShare = 1e-3  # fixed [HIMLoco]
 
         class concurrent:
-            """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (concurrent.py)."""
+            """The actor reads its newest frame and a latent, of a teacher or a student (students/concurrent.py)."""
 
             # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
             groups: list[str] = []
@@ -131,12 +133,13 @@ class RobotTaskCfgPPO(Config):
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
     class distillation:
-        """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
+        """Replaces `algorithm` if there is a teacher, which the actor imitates. From class_name on rsl-rl's keys."""
 
         # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
         teacher: str = ""
         init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
-        class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
+        # or "Distillation": rsl-rl's own, same results, slower
+        class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"
         num_learning_epochs: SmallInt = 5  # [R 1; ours: docs/lab.md]
         gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
         learning_rate: PositiveShare = 1e-3  # [R]
@@ -145,7 +148,7 @@ class RobotTaskCfgPPO(Config):
         optimizer: str = "adam"  # [R]
 
     class warm_start:
-        """Training that begins with the actor of another run: `train.py --init`."""
+        """Training that starts from the actor of another run: `train.py --init`."""
 
         policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
         init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
@@ -153,13 +156,13 @@ class RobotTaskCfgPPO(Config):
         critic_warmup: Iterations = 20
 
     class anneal:
-        """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""
+        """End values of numbers of `algorithm`, linear over max_iterations or --max_time; 0: it stays [ours]."""
 
         entropy_coef: NonNegative = 0.0
         desired_kl: NonNegative = 0.0
 
     class cpu:
-        """What train.py takes on a CPU instead, before the command line has its say [ours: docs/lab.md]."""
+        """Values that train.py takes on a CPU; flags override them [ours: docs/lab.md]."""
 
         enable: bool = True
         envs_per_core: Count = 256  # worlds; the task's own number, if that is less
@@ -175,30 +178,33 @@ class RobotTaskCfgPPO(Config):
         update_threads: Threads = 0
 
     class symmetry:
-        """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
+        """Left-right symmetry in the update, as in Mittal et al. 2024. How rows mirror: envs/mirror.py."""
 
         use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
         use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
         mirror_loss_coeff: NonNegative = 0.0  # weight of that pull, mean square over actions [-] [R]
 
     def check(self, num_envs: int) -> None:
-        """Raise ConfigError at the first value that fits its field, but not the others, or not so many worlds."""
+        """Raise ConfigError for values that do not fit each other, or the number of worlds."""
         samples = num_envs * self.runner.num_steps_per_env
         if samples < self.algorithm.num_mini_batches:
             raise ConfigError(
-                f"an iteration has {samples} samples ({num_envs} worlds x {self.runner.num_steps_per_env} steps), fewer than "
-                f"algorithm.num_mini_batches = {self.algorithm.num_mini_batches}; raise one of the former or lower the latter"
+                f"an iteration has {samples} samples ({num_envs} worlds x {self.runner.num_steps_per_env} steps), "
+                f"fewer than algorithm.num_mini_batches = {self.algorithm.num_mini_batches}; "
+                "raise one of the former or lower the latter"
             )
         steps, length = self.runner.num_steps_per_env, self.distillation.gradient_length
         if self.distillation.teacher and steps % length:
             divisors = ", ".join(str(i) for i in range(1, steps + 1) if steps % i == 0)
             raise ConfigError(
-                f"distillation.gradient_length is {length}, which leaves {steps % length} of runner.num_steps_per_env = {steps} steps "
+                f"distillation.gradient_length is {length}, which leaves {steps % length} of "
+                f"runner.num_steps_per_env = {steps} steps "
                 f"unused; take one of {divisors}"
             )
         if self.symmetry.use_mirror_loss and not self.symmetry.mirror_loss_coeff:
             raise ConfigError(
-                "symmetry.use_mirror_loss is on, but symmetry.mirror_loss_coeff is 0: set the loss's weight, or switch it off"
+                "symmetry.use_mirror_loss is on, but symmetry.mirror_loss_coeff is 0: "
+                "set the loss's weight, or switch it off"
             )
 
 

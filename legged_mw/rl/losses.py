@@ -1,6 +1,6 @@
-"""PPO's losses and their gradients with respect to the networks' outputs, in closed form: on a GPU one kernel each, not fifty.
+"""PPO's losses for a Gaussian policy, and their gradients with respect to the networks' outputs, in closed form.
 
-What autograd would find, for a Gaussian policy. Tensors are of B samples, the mirror images after the samples they are of.
+They are autograd's values. On a GPU each is one kernel, not fifty. Tensors are of B samples; mirror images come last.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class PolicyLoss(NamedTuple):
-    """Parts of the actor's loss (), and its gradients."""
+    """Terms of the actor's loss (), and its gradients."""
 
     of_mean: Tensor  # (B, A)
-    of_std: Tensor  # as the std
+    of_std: Tensor  # shaped as the std
     surrogate: Tensor
     entropy: Tensor
-    kl: Tensor  # divergence from the policy that acted
+    kl: Tensor  # divergence from the policy of the rollout
 
 
 def own_std(distribution: GaussianDistribution) -> Tensor:
@@ -35,7 +35,7 @@ def own_std(distribution: GaussianDistribution) -> Tensor:
     log = distribution.std_type == "log"
     own = distribution.log_std_param if log else distribution.std_param
     low, high = distribution.log_std_range if log else distribution.std_range
-    std = nn.functional.hardtanh(own, min_val=low, max_val=high)  # a clamp, but its gradient is one kernel, not five
+    std = nn.functional.hardtanh(own, min_val=low, max_val=high)  # a clamp whose gradient is one kernel, not five
     return std.exp() if log else std
 
 
@@ -43,7 +43,7 @@ def own_std(distribution: GaussianDistribution) -> Tensor:
 def policy_loss(
     mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float, entropy_coef: Tensor
 ) -> PolicyLoss:
-    """PPO's clipped surrogate loss less ``entropy_coef`` times the entropy. Entropy and divergence are not of mirror images."""
+    """PPO's clipped surrogate loss less ``entropy_coef`` times the entropy. Entropy and KL leave out mirror images."""
     assert batch.old_distribution_params is not None
     kernels, old = kernels_for(mean), batch.old_distribution_params
     if kernels and std.dim() == 1:
@@ -63,7 +63,7 @@ def policy_loss(
     log_prob = -(0.5 * z.square() + std.log() + _HALF_LOG_2PI).sum(dim=1, keepdim=True)
     ratio = torch.exp(log_prob - batch.old_actions_log_prob)  # type: ignore[operator]
     plain, clipped = -advantages * ratio, -advantages * ratio.clamp(1.0 - clip, 1.0 + clip)  # type: ignore[operator]
-    weight = torch.where(plain < clipped, 0.0, plain) / len(mean)  # a clipped ratio has no slope
+    weight = torch.where(plain < clipped, 0.0, plain) / len(mean)  # a clipped ratio has no gradient
     of_mean, of_std = weight * z / std, weight * (z.square() - 1.0) / std
     own = std[:size] if std.dim() == 2 else std.expand(size, -1)
     of_std[:size] -= entropy_coef / size / own

@@ -1,63 +1,120 @@
-"""rsl-rl's PPO recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no question to the host.
-
-On a CPU the same code runs as it is written: it prepares each minibatch once, not once an epoch.
+"""rsl-rl's PPO recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no read from the device.
 
 Acting, the returns and the whole update (all epochs and minibatches: forward, loss, backward, clipping, learning rate,
-Adam) are one graph each. A graph remembers addresses, so what rsl-rl rebinds every iteration (advantages, the
-normalisers' std) is copied into tensors that stay. Actor and critic share nothing, so they run side by side.
+Adam) are one graph each. A graph remembers addresses, so tensors that rsl-rl rebinds every iteration (advantages, the
+normalisers' std) are copied into tensors that stay. Actor and critic share no parameter, so they run side by side.
+
+On a CPU the same code runs unrecorded. It prepares each minibatch once, not once an epoch.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.extensions import Symmetry
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules import EmpiricalNormalization
+from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import FlatAdam, make_recordable
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.statistics import BOUND
+from legged_mw.rl.adam import FlatAdam, make_recordable, plain_state
 from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
 from legged_mw.rl.losses import own_std, policy_loss, value_loss
-from legged_mw.rl.recorded import Memories, Recorded, RegressingModel, Sequenced, trained_parts, why_stock
-from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
 _MIN_RATE, MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
 
 
+class Recorded:
+    """First parent of a recorded learner. The second, rsl-rl's algorithm, does everything if not ``graphed``."""
+
+    graphed: bool
+    learning_rate: float
+    optimizer: Any
+    device: str
+    _rates: Sequence[Tensor | float]  # of the optimizer's groups
+    _memories: Memories
+
+    def _begin(self) -> None:
+        """Make the fixed tensors, and graphs to be recorded at their next calls."""
+        raise NotImplementedError
+
+    def release(self) -> None:
+        """Drop the recorded graphs: NCCL does not close a connection that a CUDA graph still uses."""
+        if self.graphed:
+            self._begin()
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
+        """Store the transition, and clear the memories of worlds whose episode ended."""
+        super().process_env_step(obs, rewards, dones, extras)  # type: ignore[misc]
+        if self.graphed:
+            self._memories.forget(dones)
+
+    def save(self) -> dict[str, Any]:
+        """State of the networks and the optimizer, in rsl-rl's form."""
+        content = super().save()  # type: ignore[misc]
+        if self.graphed:
+            rates = [self.learning_rate, *map(float, self._rates[1:])]
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
+        return content
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Load a checkpoint of this class or of rsl-rl's own; distillation also takes its teacher from one of PPO."""
+        iteration = super().load(loaded_dict, load_cfg, strict)  # type: ignore[misc]
+        if self.graphed:
+            make_recordable(self.optimizer, self._rates, str(self.device))
+            self._begin()  # Adam's state has new addresses
+        return iteration
+
+
+def why_stock(learner: Any, policy: MLPModel, other: MLPModel, regressing: MLPModel) -> str | None:
+    """Why a learner of two networks cannot be recorded, or None. Only ``regressing`` may be a RegressingModel."""
+    for network in (policy, other):
+        known = type(network) is MLPModel or isinstance(network, RememberingModel)
+        if not known and not (network is regressing and isinstance(network, RegressingModel)):
+            return f"a network is a {type(network).__name__}"
+    if learner.use_mixed_precision:
+        return "use_mixed_precision is set"
+    if getattr(type(policy.distribution), "sample", None) is not GaussianDistribution.sample:
+        return f"actions are drawn from a {type(policy.distribution).__name__}"
+    if type(learner.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
+        return f"the optimizer is {type(learner.optimizer).__name__}"
+    return None
+
+
 class Minibatch(NamedTuple):
-    """Samples of an update, and what the networks see of them."""
+    """Samples of an update, and the inputs of the networks."""
 
     batch: RolloutStorage.Batch
     actor_input: Tensor | Sequenced  # (B, size), normalised; a sequence for a network with a memory
     critic_input: Tensor | Sequenced
-    lesson: tuple[Tensor, ...] = ()  # what the actor's estimator learns from
+    regression_batch: tuple[Tensor, ...] = ()  # of the actor's estimator
 
 
 class GraphedPPO(Recorded, PPO):
-    """PPO whose update and acting are replayed CUDA graphs.
+    """PPO whose acting and update are replayed CUDA graphs.
 
-    A network with a memory (RNNModel) learns from whole worlds, in the order that is drawn; else from samples.
-    What cannot be recorded (a network that is not a plain MLPModel or RNNModel or shares parameters, RND, mixed precision, an optimizer
-    other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
-    three updates of a run are launched step by step and the fourth is recorded: nothing is warmed up on a throw-away step.
-    On a CPU nothing is recorded.
+    Minibatches are drawn from samples, or from whole worlds if a network has a memory (RNNModel). The first three
+    updates run eagerly and the fourth is recorded, so none is wasted on warming up. rsl-rl's own update runs instead,
+    and a line says so, with a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed precision,
+    an optimizer other than Adam or AdamW, or a distribution that is not Gaussian.
     """
 
-    critic_only = False  # of a warm start: the actor stays as it is
+    critic_only = False  # during the warm-up of a warm start: the actor does not learn
     half = False  # see ``learn_in_half``
-    _bound: float | None  # of the adaptive learning rate, where it is another than rsl-rl's
-    _plain_rate: float  # the learning rate where nothing is recorded
-    _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
+    _bound: float | None  # on the adaptive learning rate, if the config sets one
+    _plain_rate: float  # the learning rate, if not graphed
+    _rate: Tensor | None = None  # the learning rate () if graphed, float64 like rsl-rl's Python number
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
         self._recurrent = actor.is_recurrent or critic.is_recurrent
@@ -86,11 +143,11 @@ class GraphedPPO(Recorded, PPO):
         # cuDNN wants the weights of its own layers in its own order
         flat = [] if self._recurrent else enumerate(self._parts)
         self._adams = [FlatAdam(self.optimizer, max(0, i - 1), part, self.max_grad_norm) for i, part in flat]
-        self.undo = Undo(self, (self.actor, self.critic))
+        self.rollback = UpdateRollback(self, (self.actor, self.critic))
         self._begin()
 
     def _why_stock(self) -> str | None:
-        """What keeps this configuration from being recorded, or None."""
+        """Why this configuration cannot be recorded, or None."""
         if self.rnd:
             return "rnd_cfg is set"
         if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
@@ -98,15 +155,13 @@ class GraphedPPO(Recorded, PPO):
         return why_stock(self, self.actor, self.critic, regressing=self.actor)
 
     def _begin(self) -> None:
-        """Fixed tensors, and graphs that are not recorded yet."""
         st, device = self.storage, self.device
         drawn = st.num_envs if self._recurrent else st.num_envs * st.num_transitions_per_env
-        self._share = drawn // self.num_mini_batches  # of a minibatch, in samples or in whole worlds
-        self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
-        self._obs = TensorDict(
-            {name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device
-        )
-        # of each transition
+        self._share = drawn // self.num_mini_batches  # worlds or samples a minibatch
+        self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # samples a minibatch
+        first = {name: value[0].clone() for name, value in st.observations.items()}
+        self._obs = TensorDict(first, [st.num_envs], device=device)
+        # the world of each transition
         self._worlds = torch.arange(st.num_envs, device=device).expand(st.num_transitions_per_env, -1)
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
         self._memories = Memories((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
@@ -115,10 +170,8 @@ class GraphedPPO(Recorded, PPO):
         more += [self.actor.regression] if isinstance(self.actor, RegressingModel) else []
         self._loss_names = ("value", "surrogate", "entropy", *more)
         self._losses = torch.zeros(len(self._loss_names), device=device)
-        self._entropy_coef, self._desired_kl = (
-            torch.zeros((), device=device),
-            torch.zeros((), dtype=torch.float64, device=device),
-        )
+        self._entropy_coef = torch.zeros((), device=device)
+        self._desired_kl = torch.zeros((), dtype=torch.float64, device=device)
         plain = [model for model in (self.actor, self.critic) if self.half and type(model) is MLPModel]
         self._half = {model: HalfWeights(linear) for model in plain if (linear := elu_layers(model.mlp))}
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
@@ -127,9 +180,10 @@ class GraphedPPO(Recorded, PPO):
         )
 
     def learn_critic_only(self, on: bool) -> None:
-        """From the next update on the critic learns and the actor stays as it is, or both learn again.
+        """From the next update on, train the critic only, or both networks again.
 
-        An adaptive learning rate then begins at its lowest, and is within an update where it should be: nothing is unlearned.
+        When both learn again, an adaptive learning rate begins at its lowest, so that the actor unlearns nothing;
+        within an update it has risen to where it belongs.
         """
         if on != self.critic_only:
             self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
@@ -137,8 +191,10 @@ class GraphedPPO(Recorded, PPO):
                 self.learning_rate = _MIN_RATE
 
     def learn_in_half(self) -> None:
-        """From now on the hidden layers of plain networks of ELUs compute in bfloat16, acting too: else the policy that learns is not
-        quite the one that acted. Weights, the last layer, losses and gradients of weights stay float32, sums too.
+        """Compute the hidden layers of plain networks of ELUs in bfloat16, from now on.
+
+        Acting too, or the policy that learns would differ from the one that acted. Weights and their gradients, the
+        last layer, sums and losses stay float32.
         """
         torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction = False
         self.half = True
@@ -146,7 +202,7 @@ class GraphedPPO(Recorded, PPO):
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
-        """What is launched inside runs beside what follows, until ``_meet``."""
+        """Launch the body on a second stream, beside the code after it, until ``_meet``."""
         if self._side is None:
             yield
             return
@@ -161,7 +217,7 @@ class GraphedPPO(Recorded, PPO):
     # ---- the rollout ----------------------------------------------------------------------------------------------
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sampled actions (N, A); what the transition needs is noted until ``process_env_step``."""
+        """Sampled actions (N, A); the transition keeps values and distribution until ``process_env_step``."""
         if not self.graphed:
             return super().act(obs)
         if self.storage.step == 0:
@@ -185,18 +241,18 @@ class GraphedPPO(Recorded, PPO):
         self._meet()
 
     def _act_by(self, model: MLPModel, seen: TensorDict) -> Tensor:
-        """The output of a network's MLP."""
+        """The output of the network's MLP."""
         latent = self._latent(model, seen)
         return self._forward(model, self._half[model].prepare(latent)) if model in self._half else model.mlp(latent)
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
-        """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
+        """The MLP's input. A memory takes in ``seen``: the observations, with mirror images if it learns from them."""
         if model in self._memories:
             return self._memories[model].advance(seen)
         return model.rollout_latent(self._obs) if isinstance(model, RegressingModel) else model.get_latent(self._obs)
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Returns and advantages of the stored transitions, into the storage."""
+        """Write returns and advantages of the stored transitions into the storage."""
         if not self.graphed:
             super().compute_returns(obs)
         else:
@@ -206,7 +262,7 @@ class GraphedPPO(Recorded, PPO):
 
     def _compute_returns(self) -> None:
         memory = self._memories.get(self.critic)
-        # rsl-rl looks once more, and so does not change ours
+        # rsl-rl steps the critic once more: on a copy of the memory
         self.critic.reset(hidden_state=memory.for_rsl_rl() if memory else None)
         super().compute_returns(self._obs)
         self.critic.reset()
@@ -215,7 +271,7 @@ class GraphedPPO(Recorded, PPO):
     # ---- the update -----------------------------------------------------------------------------------------------
 
     def update(self) -> dict[str, Any]:
-        """Epochs of minibatches over the storage; returns mean losses, tensors () whose reading waits for the device."""
+        """Learn from the storage; returns mean losses as tensors ()."""
         if not self.graphed:
             return super().update()
         torch.randperm(len(self._order), out=self._order)  # one for all epochs, as in rsl-rl
@@ -226,7 +282,7 @@ class GraphedPPO(Recorded, PPO):
         return dict(zip(self._loss_names, self._losses.clone().unbind(), strict=True))
 
     def _update(self) -> None:
-        self.undo.remember()
+        self.rollback.begin()
         self._losses.zero_()
         batches = [self._prepare(indices) for indices in self._order.split(self._share)]
         for _ in range(self.num_learning_epochs):
@@ -235,18 +291,16 @@ class GraphedPPO(Recorded, PPO):
         self._losses /= self.num_learning_epochs * self.num_mini_batches
         with torch.no_grad():
             self._update_normalizers()
-        self.undo.settle(self._losses)
+        self.rollback.finish(self._losses)
 
     def _prepare(self, indices: Tensor) -> Minibatch:
-        """All of a minibatch that the epochs share: its samples and their mirror images, normalised inputs, advantages."""
+        """Gather what all epochs share: samples and their mirror images, normalised inputs, advantages."""
         st = self.storage
 
         def take(stored: Any) -> Tensor:
-            return (
-                stored.index_select(1, indices).flatten(0, 1)
-                if self._recurrent
-                else stored.flatten(0, 1).index_select(0, indices)
-            )
+            if self._recurrent:
+                return stored.index_select(1, indices).flatten(0, 1)
+            return stored.flatten(0, 1).index_select(0, indices)
 
         assert st.distribution_params is not None
         batch = RolloutStorage.Batch(
@@ -259,19 +313,20 @@ class GraphedPPO(Recorded, PPO):
             old_distribution_params=tuple(take(stored) for stored in st.distribution_params),
         )
         if self.normalize_advantage_per_mini_batch:
-            batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
+            advantages: Any = batch.advantages
+            batch.advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        actor_input, critic_input = (
-            self._input(model, batch.observations, indices) for model in (self.actor, self.critic)
-        )
+        actor_input = self._input(self.actor, batch.observations, indices)
+        critic_input = self._input(self.critic, batch.observations, indices)
         if not isinstance(self.actor, RegressingModel):
             return Minibatch(batch, actor_input, critic_input)
-        return Minibatch(batch, actor_input, critic_input, self.actor.lesson(batch.observations, take(self._worlds)))
+        regression_batch = self.actor.regression_batch(batch.observations, take(self._worlds))
+        return Minibatch(batch, actor_input, critic_input, regression_batch)
 
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequenced:
-        """What the network sees of observations, normalised, with columns of zeros up to a multiple of four or eight."""
+        """The network's normalised input, padded with columns of zeros to a multiple of four or eight."""
         memory = self._memories.get(model)
         latent = memory.normalised(obs) if memory else model.get_latent(obs)
         if model in self._half:
@@ -281,23 +336,23 @@ class GraphedPPO(Recorded, PPO):
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
-        batch, actor_input, critic_input, lesson = minibatch
+        batch, actor_input, critic_input, regression_batch = minibatch
         self.optimizer.zero_grad()
         with self._beside():
             values = self._forward(self.critic, critic_input)
             clip = self.clip_param if self.use_clipped_value_loss else 0.0
             of_values, of_critic = value_loss(values.detach(), batch, clip, self.value_loss_coef)
             values.backward(of_values)
-        with torch.set_grad_enabled(not self.critic_only):  # an actor that stands keeps nothing for a gradient
+        with torch.set_grad_enabled(not self.critic_only):  # an actor that does not learn needs no graph
             if isinstance(self.actor, RegressingModel) and isinstance(actor_input, Tensor):
-                output, *regression = self.actor.learn(actor_input, lesson)
+                output, *regression = self.actor.learn(actor_input, regression_batch)
             else:
                 output, regression = self._forward(self.actor, actor_input), []
             gradients, parts, kl = self._policy_loss(batch, output)
         if self.critic_only:
-            kl = None  # of an actor that stands still it is rounding noise
+            kl = None  # it is rounding noise: the actor did not move
         else:
-            gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # of other parameters
+            gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # reaches the estimator only
             wanted = [(value, gradient) for value, gradient in gradients if value.requires_grad]
             torch.autograd.backward(*zip(*wanted, strict=True))  # type: ignore[arg-type]
         self._meet()
@@ -307,7 +362,7 @@ class GraphedPPO(Recorded, PPO):
     def _policy_loss(
         self, batch: Any, output: Tensor
     ) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], Tensor | None]:
-        """What of the actor has which gradient, the loss's parts by ``_loss_names``, and the KL divergence (None: fixed rate)."""
+        """(tensor, gradient) pairs of the actor, loss terms as in ``_loss_names``, and the KL (None: fixed rate)."""
         assert self.actor.distribution is not None
         self.actor.distribution.update(output)
         mean, std = self.actor.output_mean, own_std(self.actor.distribution)  # type: ignore[arg-type]
@@ -326,7 +381,7 @@ class GraphedPPO(Recorded, PPO):
         return run_mlp(model.mlp, inputs, self._half[model].read() if model in self._half else None)
 
     def _step(self, kl: Tensor | None) -> None:
-        """Adapt the rate by ``kl``, clip each part's gradient, and step; with several ranks by their means."""
+        """Adapt the rate to ``kl``, clip each part's gradient, and step. Several ranks take the means of both."""
         adams, gradients = self._adams, [adam.gradient() for adam in self._adams]
         if not adams:
             gradients = [p.grad for group in self.optimizer.param_groups for p in group["params"]]
@@ -343,7 +398,7 @@ class GraphedPPO(Recorded, PPO):
             self.optimizer.step()
 
     def _average_over_ranks(self, parts: list[Tensor]) -> None:
-        """They become their means over all ranks, in one message."""
+        """Replace ``parts`` by their means over all ranks, in one message."""
         message = torch.cat([part.flatten() for part in parts])
         torch.distributed.all_reduce(message)
         message /= self.gpu_world_size
@@ -352,7 +407,7 @@ class GraphedPPO(Recorded, PPO):
             part.copy_(mean.view_as(part))
 
     def _adapt_rate(self, kl: Tensor) -> None:
-        """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
+        """rsl-rl's rule: lower the rate if the KL is above twice ``desired_kl``, raise it if it is below half."""
         assert self._rate is not None
         highest = self._bound or MAX_RATE
         if kernels := kernels_for(kl):
@@ -376,20 +431,20 @@ class GraphedPPO(Recorded, PPO):
             self.actor.update_regression_normalizer(obs, self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
-        """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
+        """Mean square distance of the policy from its mirror image."""
         symmetry, size = self.symmetry, self._size
         assert symmetry is not None
         if not self._recurrent and (symmetry.use_mirror_loss or not symmetry.use_data_augmentation):
-            # it puts mirror images into what it is given
-            return symmetry.compute_loss(self.actor, copy.copy(batch), size)
+            return symmetry.compute_loss(self.actor, copy.copy(batch), size)  # a copy: it adds mirror images
+        # an augmented batch holds the mirror images, and the forward pass is made
         means = self.actor.output_mean
         _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
 
-    # ---- the learning rate --------------------------------------------------------------------------------------------
+    # ---- the learning rate ------------------------------------------------------------------------------------------
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take over a checkpoint; a rate that was learned without this bound comes down to it."""
+        """Load a checkpoint; clip its learning rate to the bound."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self._bound:
             self.learning_rate = min(self.learning_rate, self._bound)
@@ -397,7 +452,7 @@ class GraphedPPO(Recorded, PPO):
 
     @property
     def rate(self) -> Tensor:
-        """The learning rate as a tensor (), where it is: reading it waits for nothing."""
+        """The learning rate () as a tensor: getting it does not wait for the device."""
         return torch.tensor(self._plain_rate) if self._rate is None else self._rate
 
     @property
@@ -415,14 +470,212 @@ class GraphedPPO(Recorded, PPO):
 
 
 def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
-    """Refuse what does not go with a memory. Raises ConfigError."""
+    """Raise ConfigError for settings that a recurrent network cannot learn with."""
     if worlds < minibatches:
         raise ConfigError(
-            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, and env.num_envs is {worlds}: "
-            "raise the latter or lower the former"
+            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, "
+            f"and env.num_envs is {worlds}: raise the latter or lower the former"
         )
     if symmetry and not (recorded and symmetry["use_data_augmentation"]):
         raise ConfigError(
-            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
-            "update; switch the former on, or both off"
+            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both "
+            "this project's recorded update; switch the former on, or both off"
         )
+
+
+# ---- networks that are more than an MLP -----------------------------------------------------------------------------
+
+
+# Inputs of a recurrent network in an update; only its memory knows the parts.
+Sequenced = tuple[Tensor, ...]
+
+
+class RegressingModel(MLPModel):
+    """rsl-rl's MLPModel whose input is, in part, the output of an ``estimator``, which learns by regression.
+
+    rl/students/ holds such networks. A learner knows none of them by name.
+    """
+
+    field: str  # the config field that selects the model
+    regression: str  # the name of the regression loss
+    estimator: nn.Module
+    learning_rate: float  # of the estimator
+
+    @staticmethod
+    def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+        """Constructor arguments beyond MLPModel's, see ``actor_settings``. Raises ConfigError."""
+        raise NotImplementedError
+
+    def rollout_latent(self, obs: TensorDict) -> Tensor:
+        """The MLP's input (N, size) during the rollout, of all worlds in order."""
+        return self.get_latent(obs)
+
+    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """Inputs and targets of the regression, the same in all epochs of an update.
+
+        ``obs`` (S * B,) come from ``worlds`` (B,); S is 2 if mirror images follow them, else 1.
+        """
+        raise NotImplementedError
+
+    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The network's output for ``latent``, which may be padded with zeros, and the regression loss ().
+
+        The loss has no gradient for the parameters that the output depends on.
+        """
+        raise NotImplementedError
+
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
+        """Update the normaliser of the regression."""
+        raise NotImplementedError
+
+
+def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
+    """Parameters by part, of policy, critic and estimator if there is one, and the estimator's learning rate ().
+
+    The gradients of a part are clipped together.
+    """
+    if not isinstance(actor, RegressingModel):
+        return [[*actor.parameters()], [*critic.parameters()]], []
+    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
+    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
+    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
+
+
+class Memory(Protocol):
+    """The hidden state of a recurrent network in each of N worlds, in tensors that stay."""
+
+    now: Tensor  # (states, S, N, H): S is 2 if mirror images have a state of their own, else 1
+    start: Tensor  # the same at the start of the rollout
+
+    def advance(self, obs: Any) -> Tensor:
+        """Take in observations (N,), or (2N,) with their mirror images; returns the MLP's input (N, H)."""
+        ...
+
+    def normalised(self, obs: Any) -> Tensor:
+        """The recurrent layers' input (B, size) for observations (B,)."""
+        ...
+
+    def forget(self, ended: Tensor) -> None:
+        """Set the state to 0 where ``ended`` (N,)."""
+
+    def for_rsl_rl(self) -> Any:
+        """A copy of the state in rsl-rl's form."""
+
+    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequenced:
+        """The rollout of ``worlds`` (B,), from ``inputs`` (S * T * B, size) and ``dones`` (T, N, 1) after each step."""
+        ...
+
+    def unroll(self, sequence: Sequenced) -> Tensor:
+        """The MLP's inputs (S * T * B, H) over a sequence, with gradients."""
+        ...
+
+
+class RememberingModel(RNNModel):
+    """rsl-rl's recurrent network; a recorded learner keeps its hidden state."""
+
+    def memory(self, worlds: int, images: int, device: str) -> Memory:
+        """An empty memory; with ``images`` 2 it has a second state, which has seen mirror images only."""
+        raise NotImplementedError
+
+
+class Memories(dict[nn.Module, Memory]):
+    """Network -> memory, of the recurrent networks among ``models``."""
+
+    def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
+        remembering = [model for model in models if isinstance(model, RememberingModel)]
+        super().__init__({model: model.memory(worlds, images, device) for model in remembering})
+
+    def begin_rollout(self) -> None:
+        """Keep the present states as the start of the rollout."""
+        for memory in self.values():
+            memory.start.copy_(memory.now)
+
+    def forget(self, ended: Tensor) -> None:
+        """Set all states to 0 where ``ended`` (N,)."""
+        for memory in self.values():
+            memory.forget(ended)
+
+
+# ---- the rollback of an update --------------------------------------------------------------------------------------
+
+
+class UpdateRollback:
+    """Rolls back an update that made a parameter or a loss not finite, or that read values beyond BOUND.
+
+    Call ``begin``, update, ``finish``. Masks only, no read from the device; a good update changes in no bit.
+    """
+
+    def __init__(self, learner: Any, networks: Iterable[nn.Module]) -> None:
+        """``learner`` has rsl-rl's ``storage`` and ``optimizer``; ``networks`` are the networks that learn."""
+        self._learner, self._networks, stored = learner, list(networks), learner.storage.observations
+        self.columns = [(group, i) for group, value in stored.items() for i in range(value[0, 0].numel())]
+        device = learner.storage.rewards.device
+        self.undone = torch.zeros((), device=device)  # 1 if the last update was rolled back
+        # 1 where the last update read a bad value: by column of the observations, then the rewards
+        self.wrong = torch.zeros(len(self.columns) + 1, device=device)
+
+    def _learned(self) -> dict[str, Tensor]:
+        """Name -> tensor of all that an update changes, as of now: rsl-rl's own normaliser rebinds its std."""
+        optimizer, values = self._learner.optimizer, dict[str, Any]()
+        for i, network in enumerate(self._networks):
+            values |= {f"{i}.{name}": value for name, value in (*network.named_parameters(), *network.named_buffers())}
+        for i, memory in enumerate(optimizer.state.values()):
+            values |= {f"memory {i}.{name}": value for name, value in memory.items()}
+        values |= {f"rate {i}": group["lr"] for i, group in enumerate(optimizer.param_groups)}
+        values["rate"] = getattr(self._learner, "_rate", None)
+        return {name: value for name, value in values.items() if isinstance(value, Tensor) and value.numel()}
+
+    @torch.no_grad()
+    def begin(self) -> None:
+        """Keep the present state."""
+        self._before = [(list(kind), _join(kind.values())) for kind in _kinds(self._learned())]
+
+    @torch.no_grad()
+    def finish(self, losses: Tensor | None = None) -> None:
+        """Restore the state if inputs, results or ``losses`` of the update are bad; set ``undone`` and ``wrong``."""
+        stored = self._learner.storage
+        wrong = [_beyond(value.flatten(0, 1).flatten(1)) for value in (*stored.observations.values(), stored.rewards)]
+        self.wrong.copy_(torch.cat([*wrong[:-1], wrong[-1].any()[None]]))
+        sound = ~self.wrong.any() if losses is None else losses.isfinite().all() & ~self.wrong.any()
+        new, states = self._learned(), list[tuple[list[Tensor], Tensor, Tensor]]()
+        for names, before in self._before:
+            kind = [new.pop(name) for name in names]
+            states.append((kind, before, _join(kind)))
+        # Adam's first step made its state, which began with zeros
+        for kind in [list(kind.values()) for kind in _kinds(new)]:
+            states.append((kind, torch.zeros_like(after := _join(kind)), after))
+        for _, _, after in states:
+            sound = sound & _on(after.isfinite().all(), sound.device)
+        if getattr(self._learner, "is_multi_gpu", False):
+            shared = sound.float()
+            torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MIN)
+            sound = shared > 0.5
+        self.undone.copy_(~sound)
+        for kind, before, after in states:
+            parts = torch.where(_on(sound, after.device), after, before).split([value.numel() for value in kind])
+            shaped = [part.view_as(value) for part, value in zip(parts, kind, strict=True)]
+            torch._foreach_copy_(kind, shaped)  # pyright: ignore[reportPrivateImportUsage]
+        del self._before
+
+
+def _kinds(tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
+    """The tensors grouped by type and device, so that each group can be joined."""
+    kinds: dict[Any, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        kinds.setdefault((tensor.dtype, tensor.device), {})[name] = tensor
+    return list(kinds.values())
+
+
+def _on(value: Tensor, device: torch.device) -> Tensor:
+    """``value`` on ``device``: the step counts of rsl-rl's own Adam are on the host."""
+    return value if value.device == device else value.to(device)
+
+
+def _join(tensors: Iterable[Tensor]) -> Tensor:
+    return torch.cat([tensor.reshape(-1) for tensor in tensors])
+
+
+def _beyond(values: Tensor) -> Tensor:
+    """(C,) True for the columns of ``values`` (B, C) with a value that is not finite, or beyond BOUND."""
+    low, high = torch.aminmax(values, dim=0)
+    return ~((low >= -BOUND) & (high <= BOUND))

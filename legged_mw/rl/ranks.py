@@ -1,4 +1,4 @@
-"""One process a GPU, as torchrun starts them: who this one is, and how it leaves when another is gone."""
+"""One process a GPU, as torchrun starts them: the rank of this process, agreement, and leaving together."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import torch
 
 from legged_mw.utils.config import ConfigError
 
-_PATIENCE = 20.0  # [s] an iteration and a checkpoint take far less; torchrun kills after 30
-_sockets: list[tuple[socket.socket, socket.socket]] = []  # kept: a closed one would silence the signals
+_PATIENCE = 20.0  # [s] far more than an iteration and a checkpoint take; torchrun kills after 30
+_sockets: list[tuple[socket.socket, socket.socket]] = []  # referenced here, or they would close and silence the signals
 
 
 class Rank(NamedTuple):
@@ -31,20 +31,20 @@ class Rank(NamedTuple):
 
 
 def this_rank() -> Rank:
-    """From the environment that torchrun sets; alone without it."""
+    """The rank in torchrun's environment variables; without them, a single process."""
     index, local, count = (
         int(os.environ.get(*entry)) for entry in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1"))
     )
     return Rank(index, local, count) if count > 1 else Rank(0, 0, 1)
 
 
-def rank_device(rank: Rank, asked: str | None) -> str | None:
-    """The device this rank must use: its own GPU, or the CPU if that was asked for; alone, what was asked."""
-    if rank.count == 1 or asked == "cpu":
-        return asked
-    if asked is not None:
+def rank_device(rank: Rank, device: str | None) -> str | None:
+    """The device of this rank: its own GPU, or the CPU for ``--device cpu``. A single process keeps its ``device``."""
+    if rank.count == 1 or device == "cpu":
+        return device
+    if device is not None:
         raise ConfigError(
-            f"--device {asked}: under torchrun every process takes the GPU of its own number; leave --device out"
+            f"--device {device}: under torchrun every process takes the GPU of its own number; leave --device out"
         )
     if rank.local >= torch.cuda.device_count():
         seen = torch.cuda.device_count()
@@ -54,7 +54,7 @@ def rank_device(rank: Rank, asked: str | None) -> str | None:
 
 
 def first_ranks(value: Any, device: str) -> Any:
-    """What the first rank gives for ``value``, on all of them."""
+    """The first rank's ``value``, on all ranks."""
     if this_rank().count == 1:
         return value
     torch.distributed.broadcast_object_list(agreed := [value], device=torch.device(device))
@@ -62,13 +62,13 @@ def first_ranks(value: Any, device: str) -> Any:
 
 
 def quiet(rank: Rank) -> None:
-    """Only the first process speaks."""
+    """Silence all ranks but the first."""
     if not rank.leads:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
 
 
 def first_word(word: str) -> str:
-    """Of the ranks' words the first that is not empty, the same for all of them; alone, its own."""
+    """The first word among all ranks that is not empty, with its rank; of a single process, its own."""
     if not torch.distributed.is_initialized():
         return word
     words: list[str] = [""] * torch.distributed.get_world_size()
@@ -77,9 +77,9 @@ def first_word(word: str) -> str:
 
 
 def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
-    """End the connection once every rank is done. Nothing recorded may name it any more.
+    """Close the connection once every rank is done. No recorded graph may use it any more.
 
-    All is written by now: a connection that does not close in time is left to the end of the process, which is now.
+    All files are written by now, so a connection that does not close in time ends with the process.
     """
     if rank.count == 1:
         return
@@ -103,10 +103,10 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
 
 
 def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
-    """After SIGTERM, end this process if it does not end by itself: it may wait for a rank that is gone.
+    """After SIGTERM, end this process if it does not end by itself: it may wait for a dead rank.
 
-    torchrun sends SIGTERM to the others when one dies. A process that waits for its GPU runs no Python signal handler;
-    this thread does. Call it from the main thread.
+    torchrun sends SIGTERM to the others when one dies. A process that waits for its GPU runs no signal handler in
+    Python, but this thread does run. Call it from the main thread.
     """
     if rank.count == 1:
         return
@@ -118,7 +118,8 @@ def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
         while signal.SIGTERM not in wake.recv(16):
             pass
         threading.Event().wait(patience)
-        text = f"rank {rank.index}: still waiting for another rank {patience:g} s after SIGTERM; leaving. The last checkpoint is whole.\n"
+        text = f"rank {rank.index}: still waiting for another rank {patience:g} s after SIGTERM; leaving."
+        text += " The last checkpoint is whole.\n"
         os.write(2, text.encode())
         os._exit(128 + signal.SIGTERM)
 

@@ -1,14 +1,16 @@
-"""rsl-rl's runner, fed from class configs. It owns the loop, so that nothing in a rollout asks the device a question."""
+"""The training loop: rsl-rl's runner with a loop of its own, in which a rollout never waits for the device."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from statistics import median
+from typing import Any, Self
 
 import torch
 from rsl_rl.algorithms import Distillation
@@ -19,23 +21,34 @@ from torch import Tensor, nn
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import DivergenceStop
-from legged_mw.rl.checkpoint import check_resume
-from legged_mw.rl.health import Health
-from legged_mw.rl.keeping import Keeper, reason_of
+from legged_mw.rl.checkpoint import (
+    check_fit,
+    check_resume,
+    load_tensors,
+    random_state,
+    save_whole,
+    set_random_state,
+    take_worlds,
+    worlds_content,
+)
+from legged_mw.rl.iteration_log import (
+    Clock,
+    Console,
+    FiniteCheck,
+    Mark,
+    Message,
+    Report,
+    console_rows,
+    curves,
+    quiet_writers,
+)
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
-from legged_mw.rl.plan import Plan
 from legged_mw.rl.policies import acting
-from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.progress import Console
+from legged_mw.rl.ppo import GraphedPPO, RegressingModel, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
-from legged_mw.rl.recorded import RegressingModel
-from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
-from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
-from legged_mw.rl.runs import check_fit, load_tensors, save_whole
-from legged_mw.rl.settings import rsl_rl_config
-from legged_mw.rl.threads import UpdateThreads
+from legged_mw.rl.rsl_rl_settings import rsl_rl_config
+from legged_mw.rl.run_folder import CheckpointWriter, reason_of
 from legged_mw.rl.transfer import TEACHER, adapt
-from legged_mw.rl.undo import Undo
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -44,9 +57,8 @@ class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a checkpoint;
-    ``diverged`` says why the runner set it by itself, ``begins_anew`` why ``load`` did not find the worlds of a checkpoint. Set
-    ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
+    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a
+    checkpoint.
     """
 
     env: RobotTask
@@ -58,27 +70,28 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
-        self.deadline: float | None = None  # the time at which `learn` shall be done, and all annealed [s]
-        self.plan = Plan()
-        self.diverged = ""  # why training had to end, in words
-        self.begins_anew = "it is a new run"
-        self.keeper: Keeper | None = None  # writes checkpoints; made in `learn` where there is a folder
-        self._watch = DivergenceStop()
+        self.deadline: float | None = None  # end of `learn` and of its annealing [s, time.time()]
+        self.schedule = TrainingSchedule()
+        self.diverged = ""  # why the runner set `stop` by itself
+        self.why_not_exact = "it is a new run"  # why `load` did not restore the worlds of a checkpoint
+        self.writer: CheckpointWriter | None = None  # made in `learn` if the run has a folder
+        self._divergence = DivergenceStop()
         recorded = getattr(self.alg, "graphed", False)
-        self._undo: Undo = self.alg.undo if recorded else Undo(self.alg, self._networks().values())  # type: ignore[union-attr]
-        self._settles = not recorded  # the recorded update undoes itself
-        self._health = Health([name for each in env.nonfinite for name in each.names], self._stored_names())
+        learner: Any = self.alg
+        self._rollback = learner.rollback if recorded else UpdateRollback(learner, self._networks().values())
+        self._rolls_back = not recorded  # the recorded update rolls itself back
+        self._finite_check = FiniteCheck([name for each in env.nonfinite for name in each.names], self._stored_names())
+        # policy -> figures, which are logged: called every `exam_interval` iterations and after the last
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
-        self.update_threads = (
-            UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
-        )
+        threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores())
+        self.update_threads = threads if device == "cpu" else nullcontext()
         self.console = Console()
         self._warned_overflow = self._curves_lost = False
         self._last_means: dict[str, float] = {}
 
     def _configure_multi_gpu(self) -> None:
-        """rsl-rl's own (NCCL, a GPU a process); processes on a CPU talk through gloo."""
+        """rsl-rl's own method on GPUs (NCCL); gloo between processes on a CPU."""
         rank = this_rank()
         if rank.count == 1 or self.device != "cpu":
             super()._configure_multi_gpu()
@@ -91,7 +104,7 @@ class Runner(OnPolicyRunner):
     # ---- the loop -------------------------------------------------------------------------------------------------
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = True) -> None:
-        """Run that many iterations: roll out, update, log, save. Ends early, after a checkpoint, once ``stop`` is set.
+        """Run that many iterations: roll out, update, log, save. End early, after a checkpoint, once ``stop`` is set.
 
         On a GPU an iteration is logged while the next one runs, so that the device never waits for the host.
         """
@@ -103,18 +116,18 @@ class Runner(OnPolicyRunner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        if self.logger.log_dir and not self.keeper:
-            self.keeper = Keeper(Path(self.logger.log_dir), self.cfg["keep_checkpoints"], this_rank())
+        if self.logger.log_dir and not self.writer:
+            self.writer = CheckpointWriter(Path(self.logger.log_dir), self.cfg["keep_checkpoints"], this_rank())
         self._open_curves()
         self.env.take_statistics()
         clock, waiting = Clock(self.device), None
-        self._make_plan(self.current_learning_iteration + num_learning_iterations)
+        self._make_schedule(self.current_learning_iteration + num_learning_iterations)
         self._all_stop = False
         start = clock.mark()
-        while self.current_learning_iteration < self.plan.last and not self._must_stop():
+        while self.current_learning_iteration < self.schedule.last and not self._must_stop():
             self._anneal()  # first, so that a resumed rollout is what it would have been
-            if self._settles:
-                self._undo.remember()
+            if self._rolls_back:
+                self._rollback.begin()
             obs = self._rollout(obs)
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
@@ -129,10 +142,10 @@ class Runner(OnPolicyRunner):
                 self.env.domain_rand.redraw()
             if (
                 self.current_learning_iteration % self.cfg["save_interval"] == 0
-                and self.current_learning_iteration < self.plan.last
+                and self.current_learning_iteration < self.schedule.last
             ):
                 self._save_checkpoint()
-            # what waits to be logged still does: ranks must hear of a stop in the same iteration
+            # the waiting report is not logged before an exam: ranks must learn of a stop in the same iteration
             if self._exam_is_due():
                 self._examine()
                 start = clock.mark()
@@ -143,23 +156,23 @@ class Runner(OnPolicyRunner):
             self._examine()
         self._end_curves()
 
-    def _make_plan(self, last: int) -> None:
-        """Until the iteration ``last`` or the deadline. Ranks go by the first one's clock."""
-        self.plan = Plan(last, self.deadline, self.plan.seconds)
-        self.plan.done, self.console.deadline = first_ranks(self.plan.done, self.device), self.deadline
+    def _make_schedule(self, last: int) -> None:
+        """Plan until the iteration ``last`` or the deadline, by the clock of the first rank."""
+        self.schedule = TrainingSchedule(last, self.deadline, self.schedule.seconds)
+        self.schedule.done, self.console.deadline = first_ranks(self.schedule.done, self.device), self.deadline
 
     def _anneal(self) -> None:
-        """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
+        """Set the annealed numbers, linear from the first iteration to the last; end the critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
             self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
-        done = self.plan.begin(self.current_learning_iteration)
+        done = self.schedule.begin(self.current_learning_iteration)
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
         self.env.on_training_progress(done)
 
     def _must_stop(self) -> bool:
-        """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""
+        """Whether to stop. Ranks stop together, one iteration after the first signal: an update needs all of them."""
         if not self.is_distributed:
             return self.stop is not None
         if self._all_stop:
@@ -175,130 +188,138 @@ class Runner(OnPolicyRunner):
 
     def _update(self) -> dict[str, Any]:
         with self.update_threads:
-            if not self._settles:
+            if not self._rolls_back:
                 return self.alg.update()
             try:
                 losses = self.alg.update()
-            except (RuntimeError, ValueError):  # rsl-rl's own draws from distributions that are not finite
-                self._undo.settle()
-                if not self._undo.undone:
+            except (RuntimeError, ValueError):  # rsl-rl's own update raises if a distribution is not finite
+                self._rollback.finish()
+                if not self._rollback.undone:
                     raise
                 self.alg.storage.clear()
                 return {}
-            self._undo.settle()
+            self._rollback.finish()
             return losses
 
     def _exam_is_due(self) -> bool:
-        """Every ``exam_interval`` iterations; the last iteration's exam waits until the last checkpoint is written."""
+        """Every ``exam_interval`` iterations but the last, whose exam comes after the last checkpoint."""
         interval, done = self.cfg["exam_interval"], self.current_learning_iteration
-        return self.examine is not None and interval > 0 and done % interval == 0 and done < self.plan.last
+        return self.examine is not None and interval > 0 and done % interval == 0 and done < self.schedule.last
 
     def _next_exam(self, done: int) -> int | None:
-        """The iteration after which the next exam comes, if any does."""
+        """The iteration that ends with the next exam, or None."""
         interval = self.cfg["exam_interval"]
-        return (
-            min((done // interval + 1) * interval, self.plan.last)
-            if self.examine is not None and interval > 0
-            else None
-        )
+        if self.examine is None or interval <= 0:
+            return None
+        return min((done // interval + 1) * interval, self.schedule.last)
 
     def _examine(self) -> None:
-        """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
+        """Grade the present policy. Only the first rank has an exam; the others wait in the next update."""
         assert self.examine is not None
         if self.device != "cpu":
-            torch.cuda.synchronize(self.device)  # what is still queued is not the exam's time
+            torch.cuda.synchronize(self.device)  # so that the exam's time is the exam's alone
         policy, begun = self.alg.get_policy(), time.time()
         training, memory = policy.training, policy.get_hidden_state()
         try:
             figures = self.examine(policy.eval())
-        except Exception as error:  # hours of training are not to be lost to a figure in TensorBoard
+        except Exception as error:  # a failed exam must not cost hours of training
             print(f"WARNING: the exam failed, training goes on without: {type(error).__name__}: {error}", flush=True)
             self.examine = None
             return
         finally:
             policy.train(training)
-            policy.reset(hidden_state=memory)  # of the worlds in training
+            policy.reset(hidden_state=memory)  # of the training's worlds
         self.last_exam = self.current_learning_iteration, figures
         found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
         self._draw_curves(found, self.current_learning_iteration)
-        self.console.exam(self.current_learning_iteration, self.plan.last, figures)
+        self.console.exam(self.current_learning_iteration, self.schedule.last, figures)
 
-    # ---- what the user sees ---------------------------------------------------------------------------------------
+    # ---- the log --------------------------------------------------------------------------------------------------
 
     def _report(self, losses: dict[str, Any], marks: tuple[Mark, Mark, Mark]) -> Report:
         """Count the iteration and send its numbers to the host, without waiting for them."""
         self.current_learning_iteration += 1
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
-        asks = float(self.stop is not None), self.plan.room() if self.gpu_global_rank == 0 else 0.0
-        taken = (
-            [each.take() for each in self.env.nonfinite],
-            [torch.full((1,), value, device=self.device) for value in asks],
-        )
-        parts = [self.env.take_statistics(), *map(torch.cat, taken)]
-        summed, sizes = torch.cat(parts), [len(part) for part in parts]
+
+        def vector(*values: Any) -> Tensor:
+            each = [
+                value.to(self.device, torch.float)
+                if isinstance(value, Tensor)
+                else torch.full((), float(value), device=self.device)  # a copy from the host would wait for the device
+                for value in values
+            ]
+            return torch.stack(each) if each else torch.zeros(0, device=self.device)
+
+        summed = {
+            "statistics": self.env.take_statistics(),
+            "nonfinite": torch.cat([each.take() for each in self.env.nonfinite]),
+            "stop": vector(self.stop is not None),
+            "iterations_left": vector(self.schedule.iterations_left() if self.gpu_global_rank == 0 else 0.0),
+        }
         if self.is_distributed:
-            torch.distributed.all_reduce(summed)
-        own = [torch.as_tensor(value, dtype=torch.float, device=self.device) for value in losses.values()]
-        rate = (
-            self.alg.rate
-            if isinstance(self.alg, GraphedPPO)
-            else torch.full((), self.alg.learning_rate, device=self.device)
-        )
-        own += [rate.to(self.device, torch.float), self._action_std(), self._undo.undone]
+            together = torch.cat([*summed.values()])
+            torch.distributed.all_reduce(together)
+            parts = together.split([len(part) for part in summed.values()])
+            summed = dict(zip(summed, parts, strict=True))
         message = Message(
-            torch.cat([summed, torch.stack(own), self._undo.wrong]), [*sizes, len(losses), 2, 1, len(self._undo.wrong)]
+            **summed,
+            losses=vector(*losses.values()),
+            learning_rate=vector(self.alg.rate if isinstance(self.alg, GraphedPPO) else self.alg.learning_rate),
+            action_std=vector(self._action_std()),
+            undone=vector(self._rollback.undone),
+            wrong=self._rollback.wrong,
         )
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
     def _action_std(self) -> Tensor:
-        """Mean standard deviation of the actions of the last rollout, or of another distribution than a Gaussian as it is now, ()."""
+        """Mean standard deviation () of the actions: of a Gaussian in the last rollout, else the present one."""
         policy, params = self.alg.get_policy(), getattr(self.alg.storage, "distribution_params", None)
         if isinstance(policy.distribution, GaussianDistribution) and params is not None:
             return params[1].mean()
         return policy.output_std.detach().mean()
 
     def _log(self, report: Report) -> None:
-        """One block on the console and one point a curve in the writer."""
-        statistics, nonfinite, (stop, room), lost, settings, (undone,), wrong = report.message.read()
-        numbers = self.env.name_statistics(statistics)
-        self._all_stop = stop > 0
-        self.plan.hear(report.iteration, room)
-        if verdict := self._watch.verdict(numbers):
+        """Write a line to the console and a point a curve; stop the training if the numbers say so."""
+        read = report.message.read()
+        numbers = self.env.name_statistics(read.statistics)
+        self._all_stop = read.stop[0] > 0
+        self.schedule.end_after(report.iteration, read.iterations_left[0])
+        if verdict := self._divergence.verdict(numbers):
             self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
-        losses = dict(zip(report.losses, lost, strict=True))
+        losses = dict(zip(report.losses, read.losses, strict=True))
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
-        numbers["learning_rate"], numbers["action_std"] = settings
+        [numbers["learning_rate"]], [numbers["action_std"]] = read.learning_rate, read.action_std
         collect, learn = report.seconds()
         speed = report.steps / (collect + learn)
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
         self.console.iteration(
-            report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed
+            report.iteration, self.schedule.last, self._next_exam(report.iteration), numbers, rows, speed
         )
-        warnings, verdict = self._health.judge(nonfinite, report.steps, undone > 0, wrong)
-        warnings += self._health.lengths(numbers)
+        warnings, verdict = self._finite_check.judge(read.nonfinite, report.steps, read.undone[0] > 0, read.wrong)
+        warnings += self._finite_check.lengths(numbers)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:
             self.diverged, self.stop = self.diverged or verdict, self.stop or "learning has died"
         drawn = curves(numbers, losses, speed, collect, learn, report.total_steps)
-        self._draw_curves({**drawn, "Train/undone_updates": float(self._health.undone)}, report.iteration)
+        self._draw_curves({**drawn, "Train/undone_updates": float(self._finite_check.undone)}, report.iteration)
         if numbers["overflowed"] and not self._warned_overflow:
             others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise nconmax and njmax"
             print(f"WARNING: {self.env.sim.overflow_report() or others}", flush=True)
             self._warned_overflow = True
 
     def _stored_names(self) -> list[str]:
-        """What the columns are that an update learns from, in words: of each observation group, then the rewards'."""
+        """Names of the columns that an update reads, in words: of each observation group, then the rewards."""
         table, names = self.env.observations, []
         rows = {group: [row.name for row in table.rows(group) for _ in range(row.size)] for group in table.groups}
-        for group, i in self._undo.columns:
+        for group, i in self._rollback.columns:
             names.append(
                 f"observation row '{rows[group][i]}' of '{group}'" if group in rows else f"observation group '{group}'"
             )
         return [*names, "the rewards"]
 
-    # ---- curves: what they are written to may fail, and training goes on ---------------------------------------------
+    # ---- curves: if they cannot be written, training goes on ------------------------------------------------------
 
     def _open_curves(self) -> None:
         quiet_writers()
@@ -316,7 +337,7 @@ class Runner(OnPolicyRunner):
             self._lose_curves(error)
 
     def _end_curves(self) -> None:
-        """All of them are written when the training ends; else a thread writes on, into a run that is over."""
+        """Write all curves before the training ends; else a thread would write into a finished run."""
         try:
             self.logger.stop_logging_writer()
             if flush := getattr(self.logger.writer, "flush", None):
@@ -332,47 +353,45 @@ class Runner(OnPolicyRunner):
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     def _networks(self) -> dict[str, nn.Module]:
-        """What a checkpoint holds, by rsl-rl's names: what acts, and what it learns with."""
+        """The networks in a checkpoint, by rsl-rl's names; the first is the policy."""
         names = ("student", "teacher") if isinstance(self.alg, Distillation) else ("actor", "critic")
         return {name: getattr(self.alg, name) for name in names}
 
     def _save_checkpoint(self) -> None:
-        """Write a checkpoint, unless the networks hold what is not finite: the newest one must be good to go on from."""
+        """Write a checkpoint if the networks are finite: training must be able to go on from the newest one."""
+        done = self.current_learning_iteration
         weights = [weight for network in self._networks().values() for weight in network.parameters()]
         if not all(bool(weight.isfinite().all()) for weight in weights):
-            print(
-                f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved",
-                flush=True,
-            )
+            print(f"WARNING: after iteration {done} the networks are not finite; not saved", flush=True)
             return
-        if not self.keeper:
+        if not self.writer:
             return
-        if self.keeper.write(self.current_learning_iteration, self._content, partial(worlds_content, self)):
-            self.logger.save_model(str(self.keeper.written), self.current_learning_iteration)
-        if self._curves_lost or self.keeper.moved:
+        if self.writer.write(done, self._content, partial(worlds_content, self)):
+            self.logger.save_model(str(self.writer.written), done)
+        if self._curves_lost or self.writer.moved:
             self._curves_lost = False
             self._open_curves()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Write what learning needs to go on; whole or not at all."""
+        """Write a checkpoint, whole or not at all."""
         save_whole(self._content(infos), Path(path))
         self.logger.save_model(path, self.current_learning_iteration)
 
     def _content(self, infos: dict | None = None) -> dict[str, Any]:
         """A checkpoint: tensors and plain numbers only."""
-        content = self.alg.save()
-        told = {
+        infos = {
             **(infos or {}),
             "total_steps": self.total_steps,
             "random_state": random_state(self.device),
-            **self.plan.saved(),
+            **self.schedule.saved(),
+            "env": self.env.training_state(),
         }
-        return content | {"iter": self.current_learning_iteration, "infos": {**told, "env": self.env.training_state()}}
+        return {**self.alg.save(), "iter": self.current_learning_iteration, "infos": infos}
 
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters, random state; worlds, where they are kept."""
+        """Load a checkpoint, and the worlds beside it if they are the same."""
         content = load_tensors(Path(path), map_location or self.device)
         (first, actor), (second, other) = self._networks().items()
         check_fit(content.get(f"{first}_state_dict", {}), actor.state_dict(), Path(path), first)
@@ -382,24 +401,24 @@ class Runner(OnPolicyRunner):
         check_resume(content, Path(path), self.alg.optimizer, self.env.training_state())
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
-        if isinstance(self.alg, GraphedPPO):  # as in the last update: the first one may be the first after a warm-up
+        if isinstance(self.alg, GraphedPPO):  # as in the last update, so that `_anneal` sees the end of a warm-up
             self.alg.critic_only = 0 < self.current_learning_iteration <= self.cfg["critic_warmup"]
-        # the config's number, which the user may have changed; an adaptive rate goes on
+        # a fixed rate is the config's, which the user may have changed; an adaptive one is the checkpoint's
         if getattr(self.alg, "schedule", "fixed") == "fixed":
             self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
             for group in self.alg.optimizer.param_groups:
                 if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
                     group["lr"] = self.alg.learning_rate
         infos = content.get("infos") or {}
-        self.total_steps, self.plan = infos.get("total_steps", 0), Plan(used=infos.get("seconds", 0.0))
-        self.env.load_training_state(infos.get("env", {}))  # before the random state: it begins episodes
+        self.total_steps, self.schedule = infos.get("total_steps", 0), TrainingSchedule(used=infos.get("seconds", 0.0))
+        self.env.load_training_state(infos.get("env", {}))  # before the random state: it resets worlds
         random = infos.get("random_state", {})
-        self.begins_anew = first_word(take_worlds(self, Path(path), this_rank(), random))
-        if self.begins_anew and self.env.cfg.domain_rand.redraw_iterations:  # the first ones, of the seed, it has left
-            self.env.domain_rand.redraw()
+        self.why_not_exact = first_word(take_worlds(self, Path(path), this_rank(), random))
+        if self.why_not_exact and self.env.cfg.domain_rand.redraw_iterations:
+            self.env.domain_rand.redraw()  # the seed's own draws were those of the first iterations
         if self.gpu_global_rank == 0:
             set_random_state(random, self.device)
-        elif self.begins_anew:  # the file holds the first rank's; the others must not draw the same
+        elif self.why_not_exact:  # the checkpoint holds the first rank's state; the others must draw other numbers
             torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
 
@@ -407,7 +426,7 @@ class Runner(OnPolicyRunner):
 def make_runner(
     env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None
 ) -> Runner:
-    """A runner over ``env`` from the learner's config; with that of a ``teacher`` it distils. Without ``log_dir`` it writes nothing."""
+    """A runner over ``env``. With the config of a ``teacher`` it distils; without ``log_dir`` it writes nothing."""
     half = cfg.runner.matmul_precision == "bf16"
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
@@ -434,6 +453,138 @@ def make_runner(
 
 
 def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
-    """Name what has no mirror image now, not after a rollout, if learning wants one. Raises ConfigError."""
+    """If learning needs mirror images, raise ConfigError now, not after a rollout, for rows without one."""
     if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
         _ = env.mirror
+
+
+# ---- how far a training is ------------------------------------------------------------------------------------------
+
+
+_WINDOW = 50  # iterations, whose median duration says how many more there is time for
+
+
+class TrainingSchedule:
+    """The last iteration of a training, and how much of it is ``done``: 0 in the first iteration, 1 in the last.
+
+    With a ``deadline`` the last iteration is an estimate, made again after each iteration, and ``done`` rises to 1 in
+    even steps over the iterations left. So compiling, exams and checkpoints change the steps but not the end.
+    """
+
+    def __init__(self, last: int = 0, deadline: float | None = None, used: float = 0.0) -> None:
+        """Until the iteration ``last`` or the ``deadline`` [s, time.time()]; ``used`` [s]: duration before a resume."""
+        self.last = self._wanted = last  # with a deadline, an estimate
+        self.deadline, self._used, self._begun = deadline, used, time.time()
+        room = max(deadline - self._begun, 0.0) if deadline else 0.0
+        self.done = used / (used + room) if room else 0.0
+        self._first, self._before, self._times = True, self._begun, deque[float](maxlen=_WINDOW)
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the training so far, with the time before a resume [s]; 0 if it never had a deadline."""
+        return self._used + time.time() - self._begun if self.deadline or self._used else 0.0
+
+    def saved(self) -> dict[str, float]:
+        """The entry of a checkpoint; none without a deadline, as such trainings are equal to the bit."""
+        return {"seconds": seconds} if (seconds := self.seconds) else {}
+
+    def begin(self, iteration: int) -> float:
+        """Begin an iteration, after so many others; returns ``done``."""
+        share = iteration / max(self._wanted - 1, 1)
+        if self.deadline:
+            step = 0.0 if self._first else (1.0 - self.done) / max(self.last - iteration, 1)
+            share = max(self.done + step, share)
+        self._first, self.done = False, min(share, 1.0)
+        return self.done
+
+    def iterations_left(self) -> float:
+        """End an iteration: how many more there is time for, by the median of the last ones; inf if not known."""
+        now = time.time()
+        self._times.append(now - self._before)
+        self._before = now
+        if self.deadline is None or (len(self._times) == 1 and now < self.deadline):
+            return math.inf  # the first iteration may have compiled kernels
+        pace = median(self._times if len(self._times) in (1, _WINDOW) else list(self._times)[1:])
+        return float(max(0, round((self.deadline - now) / max(pace, 1e-9))))
+
+    def end_after(self, iteration: int, room: float) -> None:
+        """There was time for ``room`` more iterations after ``iteration``."""
+        self.last = int(min(self._wanted, iteration + room))
+
+
+# ---- threads of an update on a CPU ----------------------------------------------------------------------------------
+
+
+# An update is some thousand small parallel regions, and each waits for its slowest thread. If another process takes a
+# core away, all threads wait for the scheduler, again and again: measured up to 60 times slower than one thread.
+_SLOW = 3.0  # ours: an update this many times slower than the one before starts a trial; noise stays below 2
+_GAIN = 1.2  # ours: the other number must be this many times faster to be chosen
+_PATIENCE = 50  # ours: updates on one thread before all cores are tried again; doubled each time that does not help
+
+
+class ThreadChoice:
+    """Chooses the number of threads of the next update by the durations of those before. No clock, no torch."""
+
+    def __init__(self, few: int, many: int) -> None:
+        self.few, self.many = few, many
+        self.settled = many  # the choice
+        self.threads = few  # of the next update: first the number that cannot be very slow
+        self._times: dict[int, float] = {}  # threads -> duration of the last update on as many [s]
+        self._warm, self._since, self._patience = False, 0, _PATIENCE
+
+    def took(self, seconds: float) -> str:
+        """Note the duration of an update; returns a line for the user if the choice has changed, else ''."""
+        if not self._warm:  # the first update also allocates
+            self._warm = True
+            return ""
+        before, self._times[self.threads] = self._times.get(self.threads), seconds
+        if len(self._times) < 2:
+            self.threads = self.many
+            return ""
+        if before is None or self.threads != self.settled:  # it was a trial
+            return self._settle()
+        self._since += 1
+        if self.settled == self.many and seconds > _SLOW * before:
+            self.threads = self.few
+        elif self.settled == self.few and self._since >= self._patience:
+            self.threads = self.many
+        return ""
+
+    def _settle(self) -> str:
+        before, self.settled = self.settled, better(self._times, self.settled)
+        self._patience = 2 * self._patience if self.settled == before == self.few else _PATIENCE
+        self.threads, self._since = self.settled, 0
+        if self.settled == before:
+            return ""
+        took = " and ".join(f"{self._times[threads]:.2g} s on {threads}" for threads in (before, self.settled))
+        return f"threads of an update: {took}; going on with {self.settled} (cpu.update_threads = 0)"
+
+
+def better(times: dict[int, float], settled: int) -> int:
+    """``settled``, or another number of threads that is faster by ``_GAIN``."""
+    quickest = min(times, key=lambda threads: times[threads])
+    return quickest if _GAIN * times[quickest] < times[settled] else settled
+
+
+class UpdateThreads:
+    """Context of an update: torch's number of threads. A step's small operations want one thread, so it is restored.
+
+    ``count`` 0: one thread or all ``cores``, whichever is faster; tried again when an update takes far longer than
+    usual.
+    """
+
+    def __init__(self, count: int, cores: int) -> None:
+        self._fixed = count or cores
+        self._choice = ThreadChoice(1, cores) if not count and cores > 1 else None
+
+    def __enter__(self) -> Self:
+        self._before = torch.get_num_threads()
+        torch.set_num_threads(self._choice.threads if self._choice else self._fixed)
+        self._begun = time.perf_counter()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        seconds = time.perf_counter() - self._begun
+        torch.set_num_threads(self._before)
+        if self._choice and error[0] is None and (text := self._choice.took(seconds)):
+            print(text, flush=True)

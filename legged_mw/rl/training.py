@@ -1,6 +1,6 @@
-"""What train.py does: settle what is trained on what, train it, stop and resume, and say how to go on.
+"""The work of train.py: choose config and device, train, stop and resume, and tell the user how to go on.
 
-The check of a task, the exam and the exporter are handed in, since none of them is part of the core.
+The check of a task, the exam and the exporter are arguments, since none of them is part of the core.
 """
 
 from __future__ import annotations
@@ -21,16 +21,23 @@ from rsl_rl.algorithms import Distillation
 
 from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.classes import check_classes
-from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.learner_config import fit_cpu
-from legged_mw.rl.memory_check import check_room
 from legged_mw.rl.policies import Trained, find_trained
-from legged_mw.rl.ppo import MAX_RATE
+from legged_mw.rl.ppo import MAX_RATE, Recorded
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
-from legged_mw.rl.recorded import Recorded
+from legged_mw.rl.rsl_rl_settings import check_classes, check_room
+from legged_mw.rl.run_folder import (
+    CONFIG_FILE,
+    LOCK_FILE,
+    CheckpointWriter,
+    RunLock,
+    experiment_folder,
+    find_checkpoint,
+    find_run,
+    new_run,
+    reason_of,
+)
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
     TEACHER,
@@ -50,29 +57,29 @@ from legged_mw.utils.machine import settle, usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training that ended early and can go on
-_STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
+_STEPS_PER_CORE = 6500  # a second, in training with the default section `cpu` (docs/performance.md)
 
-# raises where the step cannot be recorded; returns what it writes and a resumed run would not have
+# raises if the step cannot be recorded; returns a note on state of the task that no checkpoint holds, or ""
 Check = Callable[[LoadedTask], str]
 Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
 Begun = Callable[[Runner, Path], None]  # with the run folder
-Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder to write -> what was written, in words
+Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder -> line for the user
 
 
 class Start(NamedTuple):
-    """What a training begins with."""
+    """Where a training begins."""
 
     experiment: Path  # folder for a new run
-    run: Path | None = None  # the run to go on with
+    run: Path | None = None  # the run to resume
     checkpoint: Path | None = None
     teacher: Trained | None = None  # the policy to distil
-    policy: Trained | None = None  # the policy whose actor a new run begins with
+    policy: Trained | None = None  # a new run starts from its actor
 
-    goes_on: bool = False  # in the folder of ``run``: from its newest checkpoint
+    goes_on: bool = False  # write into the folder of ``run``: the checkpoint is its newest
 
 
 def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
-    """Give ``task`` its final config: the resumed run's, the user's, a CPU's. Returns what to begin with and the device."""
+    """Give ``task`` its final config, of the resumed run, the user and a CPU. Returns the start and the device."""
     if not torch.cuda.is_available():
         torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
     start = _resume(task, args) if args.resume else None
@@ -87,7 +94,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if start.policy:
         task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
     if fitted or start.policy:
-        apply_overrides(task, args)  # again: what the user says wins
+        apply_overrides(task, args)  # again: flags win
     if this_rank().leads and not args.check:
         writable(str(start.run or start.experiment), "runs go to", folder=True)
     _note_others(task, start)
@@ -97,37 +104,37 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     task.train.check(task.cfg.env.num_envs)
     if device != "cpu":
         torch.cuda.set_device(device)
-    seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
+    seed_everything(task.train.seed + rank.index)  # each rank draws its own worlds, commands and noise
     args.eager |= not _announce(task, device, rank, args.max_time)
     return start, device
 
 
 def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
-    """Find the run to go on with and take over its config."""
+    """Find the run to resume and take its config."""
     experiment = experiment_folder(task, args.experiment_name)
     run = find_run(experiment, args.load_run or "-1")
     checkpoint, config = find_checkpoint(run, args.checkpoint), run / CONFIG_FILE
     start = Start(experiment, run, checkpoint, goes_on=checkpoint == find_checkpoint(run, -1))
     if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
-        _lock(start).release()  # else it is known only after the environment is made
+        _lock(start).release()  # raise now, not after the environment is made
     for section in update_from_run(task, load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
 
 
 def _find_others(task: LoadedTask, start: Start) -> Start:
-    """Add the teacher and the policy to begin with, where the config names them. A resumed run has its teacher beside it."""
-    asked, begin = task.train.distillation.teacher, task.train.warm_start.policy
-    if asked:
-        asked = str(start.run / TEACHER) if start.run else asked
-        start = start._replace(teacher=find_trained(asked, start.experiment, "--teacher", task))
+    """Find teacher and warm start that the config names. The folder of a run holds a copy of its teacher."""
+    teacher, begin = task.train.distillation.teacher, task.train.warm_start.policy
+    if teacher:
+        teacher = str(start.run / TEACHER) if start.run else teacher
+        start = start._replace(teacher=find_trained(teacher, start.experiment, "--teacher", task))
     if begin and not start.run:
         start = start._replace(policy=find_trained(begin, start.experiment, "--init", task))
     return start
 
 
 def _note_others(task: LoadedTask, start: Start) -> None:
-    """Say which policies they are, and write it into the config."""
+    """Print which policies they are, and write it into the config."""
     for trained, section, field in ((start.teacher, "distillation", "teacher"), (start.policy, "warm_start", "policy")):
         if trained and not start.run:
             file = shown(trained.source.checkpoint)
@@ -135,12 +142,13 @@ def _note_others(task: LoadedTask, start: Start) -> None:
             print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {file}")
     if start.teacher and (task.train.symmetry.use_data_augmentation or task.train.symmetry.use_mirror_loss):
         print(
-            "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again"
+            "symmetry is off while a student is distilled, as rsl-rl's distillation has none; "
+            "PPO from the student has it again"
         )
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
-    """Say what is trained on what, and what makes that slow; on a CPU how long, or at ``most`` [s]. Returns whether it is recordable."""
+    """Print task, device, reasons for a low speed, on a CPU the duration. Returns whether steps can be recorded."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
     print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
@@ -153,33 +161,31 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     cores, runner = usable_cores(), task.train.runner
     steps = runner.max_iterations * worlds * runner.num_steps_per_env
     minutes = steps / (_STEPS_PER_CORE * cores) / 60
-    rough = task.to_dict()["terrain"].get("mesh_type", "plane") != "plane"
-    slow = "rough ground takes a CPU several times as long as a plane, and wants a GPU"
-    plan = (
-        f"{steps:,} steps; {slow}"
-        if rough
-        else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
-    )
-    print(
-        f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}",
-        flush=True,
-    )
+    plan = f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
+    if task.to_dict()["terrain"].get("mesh_type", "plane") != "plane":
+        plan = f"{steps:,} steps; rough ground takes a CPU several times as long as a plane, and wants a GPU"
+    if most and most < 60 * minutes:
+        plan += f"; --max_time ends it after {most / 60:.3g} min"
+    print(f"{cores} cores: {plan}", flush=True)
     return True
 
 
 def advice_on_rate(task: LoadedTask) -> str:
-    """A line where a memory may lose its way on a GPU, as many samples let the adaptive learning rate rise (docs/lab.md, Blind stairs)."""
+    """A warning for a recurrent network on a GPU: with many samples the adaptive learning rate rises too far for it.
+
+    See docs/lab.md, Blind stairs.
+    """
     algorithm, networks = task.train.algorithm, (task.train.actor, task.train.critic)
-    remembers = (
-        any(network.class_name.endswith("RNNModel") for network in networks) and not task.train.distillation.teacher
-    )
-    if not remembers or algorithm.schedule == "fixed" or algorithm.max_learning_rate < MAX_RATE:
+    recurrent = any(network.class_name.endswith("RNNModel") for network in networks)
+    bounded = algorithm.schedule == "fixed" or algorithm.max_learning_rate < MAX_RATE
+    if not recurrent or bounded or task.train.distillation.teacher:
         return ""
-    return "a memory loses its way where the learning rate rises far: --set algorithm.max_learning_rate=1e-3 (docs/training.md, A memory)\n"
+    advice = "--set algorithm.max_learning_rate=1e-3 (docs/training.md, A memory)"
+    return f"a memory loses its way where the learning rate rises far: {advice}\n"
 
 
 def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
-    """Inside, a line says so if the start waits for kernels."""
+    """Context that prints a line if the start waits for kernels to compile."""
     return (
         device_facts(device).say_compiling()
         if pick_engine(task.cfg.sim.engine, device) == "mujoco_warp"
@@ -188,7 +194,7 @@ def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[objec
 
 
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check) -> Any:
-    """The environment, if its step can be recorded and learning can work in it. With ``eager`` nothing is recorded."""
+    """Make the environment. Raises if its step cannot be recorded (unless ``eager``) or learning cannot work in it."""
     lost = check(task) if this_rank().leads and (start.run or not eager) else ""
     env = task.env_class(task.cfg, device, eager=eager)
     env.not_remembered = lost
@@ -207,7 +213,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check
 
 
 def make_learner(task: LoadedTask, env: RobotTask, start: Start) -> Runner:
-    """The learner of a new run, with what another run has learned; one that goes on has not read its checkpoint yet."""
+    """Make the runner. A new run gets its teacher or warm start here, a resumed one its checkpoint in ``train``."""
     runner = make_runner(env, task.train, None, str(env.device), start.teacher.task.train if start.teacher else None)
     if not start.checkpoint:
         _begin(runner, start)
@@ -229,16 +235,16 @@ def train(
     verbose: bool = False,
     begun: Begun | None = None,
 ) -> bool:
-    """Train from ``start`` to the last iteration, or to ``deadline`` [s], a time of the clock, or until stopped; if not, export.
+    """Train to the last iteration, to ``deadline`` [s, time.time()], or until stopped. Export if not stopped.
 
-    ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks. Returns
-    whether all is done.
+    ``begun`` is called before the first iteration, when the run folder is written; ``verbose`` prints whole blocks.
+    Returns whether the training is finished.
     """
     rank, runner = this_rank(), make_learner(task, env, start)
     env.fuse(task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
-        left = _load(runner, task, start)  # before the lock: where it is refused, nothing was written
+        left = _load(runner, task, start)  # before the lock: a refusal writes nothing
         lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
         _stop_on_signals(runner)
         leave_when_stuck(rank)
@@ -253,21 +259,22 @@ def train(
             raise UserError(error)
         if rank.leads and finished and task.train.runner.export:
             _export(task, folder, export)
-    return finished or rank.count > 1  # torchrun would take another code for a crash
+    return finished or rank.count > 1  # torchrun takes any exit code but 0 for a crash
 
 
 def _not_saved(runner: Runner) -> str:
-    """That the last checkpoint could not be written; ''."""
-    keeper, done = runner.keeper, runner.current_learning_iteration
-    if not (keeper and keeper.failed):
+    """Error line if the last checkpoint was not written, else ''."""
+    writer, done = runner.writer, runner.current_learning_iteration
+    if not (writer and writer.failed):
         return ""
-    kept = keeper.written
+    kept = writer.written
     newest = f"the newest that is written is {shown(kept)}" if kept else "none of this training is written"
-    return f"the last checkpoint, of iteration {done}, cannot be written to {shown(keeper.folder)}: {keeper.failed}; {newest}"
+    last = f"the last checkpoint, of iteration {done}"
+    return f"{last}, cannot be written to {shown(writer.folder)}: {writer.failed}; {newest}"
 
 
 def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
-    """Load the checkpoint to go on from, if there is one; returns how many iterations are left."""
+    """Load the checkpoint of a resumed run; returns how many iterations are left."""
     if start.checkpoint:
         runner.load(str(start.checkpoint))
     done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
@@ -276,13 +283,13 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
         raise ConfigError(f"{what} has done {done} iterations of {wanted}; raise --max_iterations to go on")
     if start.checkpoint:
         print(f"resuming {shown(start.checkpoint)}")
-        anew = f"worlds begin anew ({runner.begins_anew}); networks, counters and curricula go on"
-        print(anew if runner.begins_anew else "exactly: worlds and generators go on where they were", flush=True)
+        anew = f"worlds begin anew ({runner.why_not_exact}); networks, counters and curricula go on"
+        print(anew if runner.why_not_exact else "exactly: worlds and generators go on where they were", flush=True)
     return wanted - done
 
 
 def _begin(runner: Runner, start: Start) -> None:
-    """Give the networks of a new run what another one has learned."""
+    """Give a new run its teacher, or the actor of its warm start."""
     if start.teacher:
         assert isinstance(runner.alg, Distillation)
         load_teacher(runner.alg.teacher, start.teacher, runner.env)
@@ -294,7 +301,7 @@ def _begin(runner: Runner, start: Start) -> None:
 
 
 def _lock(start: Start) -> RunLock:
-    """Of the run to go on with. Raises ConfigError if it is being trained, or was meanwhile, or cannot be."""
+    """Lock the run to resume. Raises ConfigError if another process trains or has trained it, or it is read-only."""
     assert start.run
     try:
         lock = RunLock(start.run)
@@ -304,24 +311,24 @@ def _lock(start: Start) -> RunLock:
         return lock
     lock.release()
     raise ConfigError(
-        f"{shown(start.run)} has gone on since this began, to {newest.name}: another process trained there; resume it again"
+        f"{shown(start.run)} has gone on since this began, to {newest.name}: another process trained there; "
+        "resume it again"
     )
 
 
 def _open_run(
     runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None
 ) -> Path:
-    """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own.
+    """The folder that this training writes to, locked until ``held`` ends, with the config in it.
 
-    One for all ranks, made by the first. It has a ``lock`` until ``held`` ends, and is made again if somebody deletes it.
+    It is the resumed run's if the ``lock`` is given, else a new one. The first rank makes it for all of them, and makes
+    it again if somebody deletes it.
     """
-    folder = [
-        start.run
-        if start.run and lock
-        else new_run(start.experiment, task.train.runner.run_name)
-        if rank.leads
-        else Path()
-    ]
+    folder = [Path()]
+    if start.run and lock:
+        folder = [start.run]
+    elif rank.leads:
+        folder = [new_run(start.experiment, task.train.runner.run_name)]
 
     def write() -> None:
         nonlocal lock
@@ -347,16 +354,16 @@ def _open_run(
         runner.logger.log_dir = str(folder[0])
         print(f"writing to {shown(folder[0])}", flush=True)
     folder[0] = first_ranks(folder[0], runner.device)
-    runner.keeper = Keeper(folder[0], task.train.runner.keep_checkpoints, rank, restore)
+    runner.writer = CheckpointWriter(folder[0], task.train.runner.keep_checkpoints, rank, restore)
     return folder[0]
 
 
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
-    """Learn; if another rank is lost on the way, say so in a line."""
+    """Learn. Raises UserError if another rank is lost."""
     settle()
     try:
         with runner.console:
-            runner.learn(iterations, bool(runner.begins_anew))
+            runner.learn(iterations, bool(runner.why_not_exact))
         if isinstance(runner.alg, Recorded):
             runner.alg.release()
     except RuntimeError as error:
@@ -365,20 +372,20 @@ def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
             raise
         reason = str(error).strip().splitlines()[0]
         raise UserError(
-            f"rank {rank.index} lost another rank ({reason}); --resume goes on from the last checkpoint, if there is one"
+            f"rank {rank.index} lost another rank ({reason}); "
+            "--resume goes on from the last checkpoint, if there is one"
         ) from error
 
 
 def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank) -> bool:
-    """Print the last exam and the command that comes next; returns whether the training is finished."""
+    """Print the last exam and the next command; returns whether the training is finished."""
     if runner.last_exam:
         iteration, figures = runner.last_exam
-        print(
-            f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}"
-        )
-    flags, plan, done = _flags(task, folder), runner.plan, runner.current_learning_iteration
-    if runner.stop and done < plan.last:
-        left = f" --max_time {max(1, round(plan.deadline - time.time()))}s" if plan.deadline else ""
+        said = ", ".join(f"{figure} {value:.3f}" for figure, value in figures.items())
+        print(f"exam after {iteration} iterations: {said}")
+    flags, schedule, done = _flags(task, folder), runner.schedule, runner.current_learning_iteration
+    if runner.stop and done < schedule.last:
+        left = f" --max_time {max(1, round(schedule.deadline - time.time()))}s" if schedule.deadline else ""
         print(
             f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}{left}", flush=True
         )
@@ -390,37 +397,37 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
 
 
 def _flags(task: LoadedTask, folder: Path) -> str:
-    """The flags that find a run again."""
+    """The flags that name a run."""
     name = task.name if task.ships else shown(task.path)
     home = experiment_folder(load_task(name))
     return shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
 
 
 def _export(task: LoadedTask, run: Path, export: Export) -> None:
-    """Export what was trained. The training is done and saved, so that no error of an exporter may end it."""
+    """Export the trained policy. The training is saved, so an error of the exporter only prints a line."""
     folder = run / "export"
     try:
         print(export(task, find_checkpoint(run, -1), folder))
-    except Exception as error:  # whatever an exporter may throw
+    except Exception as error:  # of any kind
         reason = " ".join(f"{error}".split()) or type(error).__name__
         print(f"not exported: {reason}\n  to try again: {command('play')} {_flags(task, run)} --export {shown(folder)}")
 
 
 def _stop_on_signals(runner: Runner) -> None:
-    """Ctrl-C, SIGTERM and a hang-up ask the runner to save and stop; a second Ctrl-C stops at once.
+    """On Ctrl-C, SIGTERM and a hang-up, save and stop; a second Ctrl-C or SIGTERM stops at once.
 
-    A second hang-up does nothing: of a terminal that closes, the shell and the system send one each.
+    A second hang-up does nothing: when a terminal closes, the shell and the system send one each.
     """
 
-    def ask(number: int, _: object) -> None:
+    def stop(number: int, _: object) -> None:
         runner.stop = name = signal.Signals(number).name
-        # os.write, since print must not be called while another print is interrupted
-        with suppress(OSError):  # nobody may be there to read it
+        # os.write: print must not be called while another print is interrupted
+        with suppress(OSError):  # the terminal may be gone
             again = "" if name == "SIGHUP" else "; again to stop at once"
             os.write(1, f"{name}: saving and stopping after this iteration{again}\n".encode())
         signal.signal(number, (lambda *_: None) if name == "SIGHUP" else signal.SIG_DFL)
 
-    signal.signal(signal.SIGINT, ask)
-    signal.signal(signal.SIGTERM, ask)
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
-        signal.signal(signal.SIGHUP, ask)
+        signal.signal(signal.SIGHUP, stop)

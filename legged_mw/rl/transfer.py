@@ -1,4 +1,4 @@
-"""Learning from a policy of another run: as a student from its teacher, or by going on from its actor."""
+"""Learning from a policy of another run: as a student of a teacher, or as a warm start from its actor."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
-from legged_mw.rl.network import LEARNING_ONLY
-from legged_mw.rl.policies import NETWORK_FILE, Trained, read_actor
-from legged_mw.rl.runs import CONFIG_FILE, checkpoints
+from legged_mw.rl.policies import LEARNING_ONLY, NETWORK_FILE, Trained, read_actor
+from legged_mw.rl.run_folder import CONFIG_FILE, checkpoints
 from legged_mw.utils.commands import command_table
 from legged_mw.utils.config import ConfigError, save_yaml
 from legged_mw.utils.errors import shown, unknown
 from legged_mw.utils.task import LoadedTask
 
-TEACHER = "teacher"  # the observation group that it reads, and its folder in a student's run
-# samples that an exported normalizer stands for, as the file does not say [ours: as most have seen]
+TEACHER = "teacher"  # the observation group of a teacher, and its folder in a student's run
+# count of samples of an exported normaliser, which the file does not hold [ours: as most have seen]
 _EXPORTED_COUNT = 10**8
 
-# Fields that must be equal, since an action or a row means something else where they are not; those that a task has.
+# Fields that must be equal, or an action or a row would mean something else. Not every task has them.
 _SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "gait.offsets")
 _SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
 
 
 def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
-    """rsl-rl's ``settings`` of the learner's config ``cfg``, for the student of a ``teacher``, its network's settings, or a warm start."""
+    """Change rsl-rl's ``settings`` for a warm start, or for a student whose ``teacher`` is this network."""
     distillation, start = cfg.to_dict()["distillation"], cfg.warm_start
     settings["critic_warmup"] = start.critic_warmup if start.policy and not teacher else 0
     noise = settings["actor"].get("distribution_cfg", {})
@@ -54,13 +53,13 @@ def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any
 
 
 def attach_teacher_observations(env: RobotTask, teacher: Trained) -> None:
-    """Give ``env`` the observation group that the teacher reads. Raises ConfigError if its actions mean something else here."""
+    """Add the teacher's observation group to ``env``. Raises ConfigError if its actions mean something else here."""
     env.observations.attach(_observe(env, teacher, "the teacher"), TEACHER, TEACHER)
     env.first_observations()
 
 
 def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
-    """Give ``model`` the teacher's parameters. Raises ConfigError if it reads another number of values than ``env`` shows it."""
+    """Load the teacher's parameters into ``model``. Raises ConfigError if ``env`` gives another number of inputs."""
     path = teacher.source.checkpoint
     try:
         model.load_state_dict(read_actor(path, model, TEACHER))
@@ -70,24 +69,26 @@ def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
 
 
 def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
-    """Raise ConfigError if ``policy`` reads other rows than the actor of ``task``, or its actions mean something else."""
+    """Raise ConfigError if ``policy`` reads other rows than the actor of ``task``, or acts by another convention."""
     theirs = _observe(env, policy, "the policy to begin with").rows(TEACHER)
     ours = [row for group in task.train.obs_groups.actor for row in env.observations.rows(group)]
     if [*map(_layout, theirs)] != [*map(_layout, ours)]:
         raise ConfigError(
-            f"{shown(policy.source.checkpoint)}: it reads {_in_words(theirs)}; the actor of {task.name} reads {_in_words(ours)}"
+            f"{shown(policy.source.checkpoint)}: it reads {_in_words(theirs)}; "
+            f"the actor of {task.name} reads {_in_words(ours)}"
         )
 
 
 def begin_with(model: MLPModel, policy: Trained) -> None:
-    """Give ``model`` the actor's parameters; its noise stays its own."""
+    """Load the actor's parameters into ``model``, which keeps its own noise."""
     path, own = policy.source.checkpoint, model.state_dict()
     if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
         raise ConfigError(
-            f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; name a checkpoint"
+            f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; "
+            "name a checkpoint"
         )
     saved = read_actor(path, model)
-    # of observations, of targets
+    # the normalisers of observations and of targets
     for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:
         of = name.removesuffix("_std")
         saved |= {f"{of}_var": saved[name].square(), f"{of}count": torch.full_like(own[f"{of}count"], _EXPORTED_COUNT)}
@@ -95,18 +96,18 @@ def begin_with(model: MLPModel, policy: Trained) -> None:
 
 
 def keep_teacher(teacher: Trained, run: Path) -> None:
-    """Copy the teacher into the student's run folder, so that the run can be resumed wherever the teacher's goes."""
+    """Copy the teacher into the student's run folder: a resume needs it even if the teacher's run is gone."""
     folder = run / TEACHER
     if not folder.exists():
         folder.mkdir()
         save_yaml(folder / CONFIG_FILE, teacher.task.to_dict())
-        file = teacher.source.checkpoint  # of any name, if a flag named it; a resumed run finds it by one of these
+        file = teacher.source.checkpoint  # of any name; a resumed run looks for one of these
         known = file.name if file in checkpoints(file.parent).values() else "model_0.pt"
         shutil.copy(file, folder / (NETWORK_FILE if file.suffix == ".onnx" else known))
 
 
 def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
-    """What the policy reads in ``env``, as the group TEACHER. Raises ConfigError if something means something else there."""
+    """The policy's observations in ``env``, as the group TEACHER. Raises ConfigError if a meaning differs."""
     task, kind = policy.task, _class_in(env, policy.task.env_class)
     found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
     if kind:
@@ -114,7 +115,7 @@ def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
             seen = _observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
             if not (found := _differences(env, task.cfg, seen.rows(TEACHER))):
                 return seen
-        except ConfigError as error:  # a row of what is not sensed here
+        except ConfigError as error:  # a row that needs a sensor which is missing here
             found = [str(error)]
     raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
 
@@ -123,11 +124,11 @@ def _layout(row: Row) -> tuple[str, int, int, list[float]]:
     return row.name, row.value.shape[1], row.history, row.column_scales()
 
 
-# ---- a policy of another task in this one: what it reads here, and why its actions may mean something else --------------
+# ---- a policy of another task in this one: what it reads here, and why its actions may mean something else ----------
 
 
 def _class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
-    """``kind`` among the classes of ``env``; by its name and file, since a task's file may have been imported twice."""
+    """``kind`` among the classes of ``env``, by name and file: a task's file may have been imported twice."""
     return next(
         (
             each
@@ -141,10 +142,10 @@ def _class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
 def _observe_as(
     env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str
 ) -> Observations:
-    """Observations of ``env`` as a ``kind`` with the config ``cfg`` has them; ``name`` is what a policy reads in ``groups``.
+    """Observations of ``env`` as those of a ``kind`` with the config ``cfg``; the group ``name`` joins ``groups``.
 
-    They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for a
-    group that the table does not have.
+    They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for
+    a group that the table does not have.
     """
     table = kind.observation_rows(_as_on_a_plane(env, cfg))  # the rows go by the section noise and others
     for group in groups:
@@ -165,7 +166,7 @@ def _in_words(rows: Iterable[Row]) -> str:
 
 
 def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
-    """What keeps a policy of the config ``cfg``, which reads ``rows``, from meaning the same in ``env``: a clause for each."""
+    """Each difference, in words, by which a policy of ``cfg`` with these ``rows`` means something else in ``env``."""
     kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
     found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
     there, here = (
@@ -177,7 +178,8 @@ def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list
     theirs, ours = _as_on_a_plane(env, cfg)._load_robot("mujoco"), env.robot
     if theirs.joint_names != ours.joint_names:
         return [
-            f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"
+            f"its robot is another one, with the joints {_few(theirs.joint_names)}; "
+            f"here they are {_few(ours.joint_names)}"
         ]
     found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
     there, here = (robot.tables["control.action_scale"] for robot in (theirs, ours))
@@ -197,14 +199,14 @@ def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list
 
 
 def _as_on_a_plane(env: RobotTask, cfg: RobotTaskCfg) -> RobotTask:
-    """``env`` with another config, for what only reads it: the tensors are the same."""
+    """A shallow copy of ``env`` with another config, to read only: it shares the tensors."""
     other = copy.copy(env)
     other.cfg, other.terrain = cfg, None
     return other
 
 
 def _field(cfg: RobotTaskCfg, path: str) -> Any:
-    """A field by its path; None where the task has none of that name."""
+    """A field by its path; None if the task has no such field."""
     value: Any = cfg
     for name in path.split("."):
         value = getattr(value, name, None)

@@ -9,9 +9,9 @@ import sys
 import time
 from pathlib import Path
 
-from legged_mw.rl.keeping import reason_of
+from legged_mw.rl.checkpoint import save_whole
+from legged_mw.rl.run_folder import checkpoints, reason_of
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import checkpoints, save_whole
 from legged_mw.utils.machine import has_display
 from legged_mw.utils.task import LoadedTask
 from legged_mw.view.follow import PLAYING

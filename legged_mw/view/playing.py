@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 
-from legged_mw.rl.classes import check_classes
+from legged_mw.rl.checkpoint import load_tensors
 from legged_mw.rl.flags import require_task
 from legged_mw.rl.policies import Source, actor_in, introduce, load_policy
-from legged_mw.rl.runs import load_tensors
+from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
 from legged_mw.utils.files import writable

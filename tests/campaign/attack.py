@@ -36,7 +36,7 @@ from program import files, stopped_at_work
 
 from legged_mw import programs
 from legged_mw.deploy.controller import limited_memory
-from legged_mw.rl import policies, runs
+from legged_mw.rl import policies, run_folder
 from legged_mw.utils.cli import one_line_errors
 
 ROOM, SECONDS = 6 << 30, 60  # what an input may take before it counts as not refused: memory [byte], time [s]
@@ -72,7 +72,7 @@ class _Program:
             flags += ["--device", "cpu"]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", [f"{self.name}.py", *flags])
-            patch.setattr(runs, "logs_folder", lambda: root / "logs")
+            patch.setattr(run_folder, "logs_folder", lambda: root / "logs")
             patch.setattr(policies, "ROOT", root)  # no policy ships there
             programs.PROGRAMS[self.name]()
 

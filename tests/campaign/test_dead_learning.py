@@ -21,12 +21,11 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Observations
 from legged_mw.envs.statistics import NonFinite
 from legged_mw.rl import ppo
-from legged_mw.rl.health import Health
+from legged_mw.rl.iteration_log import FiniteCheck
 from legged_mw.rl.losses import value_loss
-from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.ppo import GraphedPPO, UpdateRollback
+from legged_mw.rl.run_folder import checkpoints
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import checkpoints
-from legged_mw.rl.undo import Undo
 
 BAD = [math.nan, math.inf, -math.inf, 1e20, -1e38]
 RUN = ["--num_envs", "8", "--eager", "--seed", "1", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
@@ -182,13 +181,17 @@ def test_rsl_rls_own_normaliser_rebinds_its_std_and_gets_the_old_one_back() -> N
     layer, normaliser = nn.Linear(3, 2), EmpiricalNormalization(3)
     network = nn.ModuleList([layer, normaliser])
     stored = SimpleNamespace(observations={"state": torch.zeros(4, 5, 3)}, rewards=torch.zeros(4, 5, 1))
-    undo = Undo(SimpleNamespace(storage=stored, optimizer=torch.optim.Adam(network.parameters())), [network])
+    rollback = UpdateRollback(
+        SimpleNamespace(storage=stored, optimizer=torch.optim.Adam(network.parameters())), [network]
+    )
     normaliser.update(3.0 * torch.randn(50, 3))
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    undo.remember()
+    rollback.begin()
     normaliser.update(torch.full((50, 3), math.nan))
-    undo.settle()
-    assert undo.undone == 1 and all(torch.equal(before[name], value) for name, value in network.state_dict().items())
+    rollback.finish()
+    assert rollback.undone == 1 and all(
+        torch.equal(before[name], value) for name, value in network.state_dict().items()
+    )
 
 
 def test_weights_that_explode_are_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,14 +215,14 @@ def test_an_update_is_undone_to_the_last_bit(value: float) -> None:
         with recordable() if not first else nullcontext():  # Adam's memory is made in the first update
             alg._update()
         alg.storage.clear()
-        assert alg.undo.undone == 1 and alg.undo.wrong[-1] == 1 and alg.learning_rate == rate
+        assert alg.rollback.undone == 1 and alg.rollback.wrong[-1] == 1 and alg.learning_rate == rate
         assert all(torch.equal(before[name], each) for name, each in parameters(alg).items())
         memory = [each for kept in alg.optimizer.state.values() for each in kept.values()]
         assert first == all(bool((each == 0).all()) for each in memory)
         collect(alg)
         alg.compute_returns(alg.storage.observations[-1])
         alg.update()
-        assert alg.undo.undone == 0 and not alg.undo.wrong.any()
+        assert alg.rollback.undone == 0 and not alg.rollback.wrong.any()
 
 
 def test_what_is_finite_keeps_its_bits() -> None:
@@ -232,6 +235,6 @@ def test_what_is_finite_keeps_its_bits() -> None:
 
 
 def test_a_warning_repeats_when_there_is_ten_times_as_much() -> None:
-    health = Health(["reward term 'x'"], ["the rewards"])
+    health = FiniteCheck(["reward term 'x'"], ["the rewards"])
     said = [len(health.judge([1.0], 1000, False, [0.0])[0]) for _ in range(101)]
     assert [i + 1 for i, lines in enumerate(said) if lines] == [1, 10, 100]

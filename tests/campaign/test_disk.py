@@ -21,11 +21,10 @@ from test_resume import EXACTLY
 from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT
-from legged_mw.rl import runs, training
-from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock
+from legged_mw.rl import checkpoint, training
 from legged_mw.rl.ranks import Rank
+from legged_mw.rl.run_folder import LOCK_FILE, CheckpointWriter, RunLock, checkpoints
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.console import SafeStream
 
@@ -71,7 +70,7 @@ def test_a_checkpoint_that_cannot_be_written_is_said_and_the_next_one_tried(
             raise OSError(code, os.strerror(code))
         replace(source, target)
 
-    monkeypatch.setattr(runs.os, "replace", fail)
+    monkeypatch.setattr(checkpoint.os, "replace", fail)
     worlds = list[list[str]]()
     before_iteration(monkeypatch, lambda *_: worlds.append([path.name for path in only_run(tmp_path).glob("worlds_*")]))
     result = train(tmp_path, 4)
@@ -95,7 +94,7 @@ def test_a_full_disk_keeps_the_newest_that_could_be_written(tmp_path: Path, monk
 
     def fill(_: Runner, iteration: int) -> None:
         if iteration == 3:
-            monkeypatch.setattr(runs, "open", lambda path, mode: Full(path, mode), raising=False)
+            monkeypatch.setattr(checkpoint, "open", lambda path, mode: Full(path, mode), raising=False)
             monkeypatch.setattr(RecordWriter, "write", lambda *_: Full(tmp_path / "curve", "wb").write(b""))
 
     before_iteration(monkeypatch, fill)
@@ -116,7 +115,7 @@ def test_a_full_disk_keeps_the_newest_that_could_be_written(tmp_path: Path, monk
 
 
 def test_a_folder_that_is_deleted_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before_iteration(monkeypatch, lambda self, i: i == 3 and shutil.rmtree(self.keeper.folder))  # type: ignore[union-attr]
+    before_iteration(monkeypatch, lambda self, i: i == 3 and shutil.rmtree(self.writer.folder))  # type: ignore[union-attr]
     result = train(tmp_path, 4)
     folder = only_run(tmp_path)
     assert result.code == 0 and sound(folder) == [3, 4] and (folder / "config.yaml").is_file()
@@ -219,10 +218,10 @@ def test_old_checkpoints_are_thinned(tmp_path: Path) -> None:
 
 def test_worlds_of_a_rank_stay_until_the_first_one_has_written_the_checkpoint(tmp_path: Path) -> None:
     """Else a kill in between would leave the newest checkpoint without them."""
-    follower, first = (Keeper(tmp_path, 0, Rank(index, index, 2)) for index in (1, 0))
+    follower, first = (CheckpointWriter(tmp_path, 0, Rank(index, index, 2)) for index in (1, 0))
 
-    def write(keeper: Keeper, iteration: int) -> set[str]:
-        assert keeper.write(iteration, dict, dict)
+    def write(writer: CheckpointWriter, iteration: int) -> set[str]:
+        assert writer.write(iteration, dict, dict)
         return {path.name for path in tmp_path.glob("worlds_*.pt")}
 
     assert write(first, 1) | write(follower, 1) == {"worlds_1_0of2.pt", "worlds_1_1of2.pt"}
@@ -235,13 +234,13 @@ def test_worlds_of_another_number_of_processes_go(tmp_path: Path) -> None:
     """Once a checkpoint after them is whole, which the first process alone knows."""
     for name in ("worlds_1.pt", "worlds_2_0of3.pt", "worlds_2_11of12.pt", "worlds_9_0of3.pt", "worlds_of_mine.pt"):
         (tmp_path / name).touch()
-    follower, first, alone = (Keeper(tmp_path, 0, Rank(*rank)) for rank in ((1, 1, 2), (0, 0, 2), (0, 0, 1)))
-    for keeper, iteration, stay in (
+    follower, first, alone = (CheckpointWriter(tmp_path, 0, Rank(*rank)) for rank in ((1, 1, 2), (0, 0, 2), (0, 0, 1)))
+    for writer, iteration, stay in (
         (follower, 3, {"worlds_1.pt", "worlds_2_0of3.pt", "worlds_2_11of12.pt", "worlds_3_1of2.pt"}),
         (first, 3, {"worlds_3_0of2.pt", "worlds_3_1of2.pt"}),
         (alone, 4, {"worlds_4.pt"}),
     ):
-        assert keeper.write(iteration, dict, dict)
+        assert writer.write(iteration, dict, dict)
         assert {path.name for path in tmp_path.glob("worlds_*")} == {*stay, "worlds_9_0of3.pt", "worlds_of_mine.pt"}
 
 
@@ -273,7 +272,7 @@ def test_a_run_that_is_being_trained_is_not_resumed(tmp_path: Path) -> None:
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
-    program = "import sys, time\nfrom pathlib import Path\nfrom legged_mw.rl.keeping import RunLock\n"
+    program = "import sys, time\nfrom pathlib import Path\nfrom legged_mw.rl.run_folder import RunLock\n"
     program += "lock = RunLock(Path(sys.argv[1]))\nlock.begin()\nprint(1, flush=True)\ntime.sleep(60)"
     child = subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
@@ -297,7 +296,7 @@ def test_a_resume_whose_checkpoint_is_not_the_newest_any_more_is_refused(
     def never(*_: object) -> bool:
         raise AssertionError
 
-    monkeypatch.setattr(Keeper, "write", never)
+    monkeypatch.setattr(CheckpointWriter, "write", never)
     build = training.build
 
     def slow_build(*args: Any) -> Any:

@@ -28,9 +28,9 @@ from legged_mw.deploy.contract import checksum, read_contract
 from legged_mw.deploy.controller import Network
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.rl import runner as running
-from legged_mw.rl.checkpoint import sealed
+from legged_mw.rl.checkpoint import load_tensors, save_whole, sealed
+from legged_mw.rl.run_folder import checkpoints, find_run, runs
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.runs import checkpoints, find_run, load_tensors, runs, save_whole
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils import files
 from legged_mw.utils.config import load_yaml, save_yaml
@@ -657,7 +657,7 @@ class _Killed(BaseException):
 
 def move_in(folder: Path, new: Path, last: int) -> int:
     """An export of the files in ``new`` to ``folder``, killed before the call ``last`` of the file system; returns how many it makes."""
-    from legged_mw.rl.export import _all_or_nothing
+    from legged_mw.export.exporter import _all_or_nothing
 
     calls, real = 0, {name: getattr(os, name) for name in ("replace", "unlink", "rmdir", "mkdir", "open", "fsync")}
 

@@ -17,7 +17,7 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.drawing.scene import visual_model
-from legged_mw.rl.export_scene import standalone
+from legged_mw.export.scene import standalone
 from legged_mw.robot.mjcf import Source, write_archive
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import read_file

@@ -12,7 +12,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, perform, rollout
 from legged_mw.eval.page import Column, about
 from legged_mw.eval.rules import ExamRules
-from legged_mw.rl import export_replay
+from legged_mw.export import replay as export_replay
 from legged_mw.sim.mujoco_engine import MujocoSimulation
 from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.task import load_task

@@ -11,10 +11,8 @@ import pytest
 import torch
 from program import SMALL, Result, assert_equal, load, refused, run, trained
 
-from legged_mw.rl.checkpoint import Checker
-from legged_mw.rl.keeping import Keeper
-from legged_mw.rl.resume import beyond
-from legged_mw.rl.runs import checkpoints, save_whole
+from legged_mw.rl.checkpoint import Checker, beyond, save_whole
+from legged_mw.rl.run_folder import CheckpointWriter, checkpoints
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = [
@@ -74,16 +72,16 @@ if os.environ.get("LEGGED_MW_CAMPAIGN") == "all":
 
 def interrupted(root: Path, *flags: str, after: int = 2) -> tuple[Path, Path]:
     """A run of three iterations, and a copy of its folder as a kill after iteration ``after`` would have left it."""
-    killed, write = root / "killed/logs/go1_flat/run", Keeper.write
+    killed, write = root / "killed/logs/go1_flat/run", CheckpointWriter.write
 
-    def write_and_copy(self: Keeper, iteration: int, *content: Any) -> bool:
+    def write_and_copy(self: CheckpointWriter, iteration: int, *content: Any) -> bool:
         done = write(self, iteration, *content)
         if iteration == after:
             shutil.copytree(self.folder, killed)
         return done
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Keeper, "write", write_and_copy)
+        patch.setattr(CheckpointWriter, "write", write_and_copy)
         result = run("train", root, *SMALL, *THREE, "--experiment_name", "whole", *flags)
     assert result.code == 0, result.err
     [whole] = (root / "logs/whole").iterdir()

@@ -73,7 +73,7 @@ def test_what_is_not_finite_stays_so(fused: None) -> None:
     before = parameters(alg)
     alg.storage.actions[0, 0, 0] = float("nan")
     update(alg)
-    assert alg.undo.undone and difference(before, parameters(alg)) == 0.0
+    assert alg.rollback.undone and difference(before, parameters(alg)) == 0.0
 
 
 @pytest.mark.parametrize("kernels", [[], ["cpu"]], ids=["torch", "fused"])

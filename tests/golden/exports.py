@@ -17,10 +17,10 @@ from golden.table import Run, Table, given_run, made_run, patched
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.rl import export as exporting
-from legged_mw.rl.export import export
-from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.keeping import RunLock
+from legged_mw.export import exporter as exporting
+from legged_mw.export.exporter import export
+from legged_mw.export.scene import among_steps, standalone
+from legged_mw.rl.run_folder import RunLock
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import begin_with
 from legged_mw.sim.terrain import make_terrain

@@ -16,9 +16,10 @@ from golden.table import Run, Table, patched
 from legged_mw.deploy import controller as policy
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.controller import Network
-from legged_mw.rl import network
+from legged_mw.rl import policies
+from legged_mw.rl.checkpoint import load_tensors, save_whole
+from legged_mw.rl.run_folder import find_checkpoint, find_run, new_run
 from legged_mw.rl.runner import Runner
-from legged_mw.rl.runs import find_checkpoint, find_run, load_tensors, new_run, save_whole
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils import files
 
@@ -109,15 +110,15 @@ def table() -> Table:
     made.add("no checkpoint in a run", lambda root: find_checkpoint(root, -1))
     made.add("no checkpoint at", lambda root: load_tensors(root / "model_5.pt", "cpu"))
     made.add("a checkpoint that is a folder", lambda root: load_tensors(root, "cpu"))
-    made.add("parameters of no file", lambda root: network.read_parameters(root / "policy.onnx", actor()))
+    made.add("parameters of no file", lambda root: policies.read_parameters(root / "policy.onnx", actor()))
     made.add(
         "parameters of text",
-        lambda root: network.read_parameters(root / "policy.onnx", actor()),
+        lambda root: policies.read_parameters(root / "policy.onnx", actor()),
         lambda root: (root / "policy.onnx").write_bytes(b"no"),
     )
     made.add(
         "parameters of another network",
-        lambda root: network.read_parameters(root / "out/policy.onnx", actor()),
+        lambda root: policies.read_parameters(root / "out/policy.onnx", actor()),
         campaign.NETWORKS[0][1],
     )
     made.add(

@@ -23,8 +23,8 @@ from legged_mw.eval.exams import find_exam, require_exam
 from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.rl.policies import Source, Trained, find_rival
 from legged_mw.rl.ranks import Rank, rank_device
+from legged_mw.rl.rsl_rl_settings import mirror
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.symmetry import mirror
 from legged_mw.rl.transfer import check_start
 from legged_mw.utils.commands import Command
 from legged_mw.utils.task import LoadedTask, Task, load_task

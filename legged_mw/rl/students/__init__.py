@@ -1,1 +1,1 @@
-"""Learners beside plain PPO: estimators, concurrent students, distillation, recurrent networks. PPO does not import them."""
+"""Estimators, concurrent students, distillation, recurrent networks. PPO does not import them."""

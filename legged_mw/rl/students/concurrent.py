@@ -1,9 +1,9 @@
-"""Concurrent teacher and student: one policy that reads a latent, which a teacher's encoder makes of what only the simulator knows, and a
-student's of what a robot has felt.
+"""Concurrent teacher and student: the policy reads a latent, of a teacher's encoder or of a student's.
 
-Part of the worlds act by the teacher's latent, the rest by the student's. PPO learns from all of them: the policy, and in the teacher's
-worlds the teacher's encoder with it. The student's encoder learns by regression to the teacher's latent alone, in all worlds. During an
-update the policy reads the student's latent that it acted with. What plays and is exported is the student's path.
+The teacher's encoder reads rows that only the simulator knows, the student's the robot's own observations. Some worlds
+act by the teacher's latent, the others by the student's. PPO trains the policy in all worlds, and the teacher's encoder
+in the teacher's worlds. The student's encoder learns by regression to the teacher's latent, in all worlds. During an
+update the policy reads the student's latent of the rollout. Play and export use the student's path.
 
 Wang et al., "CTS: Concurrent Teacher-Student Reinforcement Learning for Legged Locomotion", RA-L 2024.
 """
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.recorded import RegressingModel
+from legged_mw.rl.ppo import RegressingModel
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -31,7 +31,7 @@ _GOLDEN = 0.6180339887498949
 
 
 class ConcurrentModel(RegressingModel):
-    """Its network reads the newest frames of the observations and a latent of unit length; ``estimator`` is the student's encoder."""
+    """Its network reads the newest frames and a latent of unit length; ``estimator`` is the student's encoder."""
 
     field, regression = FIELD, "student"
 
@@ -45,7 +45,7 @@ class ConcurrentModel(RegressingModel):
         concurrent: dict[str, Any],
         **more: Any,
     ) -> None:
-        """``concurrent``: the config section, and ``newest``, (start, stop) of columns of the observations; the rest is MLPModel's.
+        """``concurrent``: the config section, and ``newest``, (start, stop) of observation columns; then MLPModel's.
 
         Without ``groups`` it is a student that only acts. ``obs`` must be of all N worlds otherwise.
         """
@@ -60,34 +60,34 @@ class ConcurrentModel(RegressingModel):
                 EmpiricalNormalization(known) if self.obs_normalization else nn.Identity(), MLP(known, *encoder)
             )
             self.register_buffer(
-                "taught", taught_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False
+                "teacher_worlds", pick_teacher_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False
             )
 
-    taught: Tensor  # (N, 1): the worlds that act by the teacher's latent
+    teacher_worlds: Tensor  # (N, 1): the worlds that act by the teacher's latent
 
     def _get_latent_dim(self) -> int:
         return sum(stop - start for start, stop in self._newest) + self._size
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """What the network reads (B, newest + E) of a student: the latent comes without its gradient."""
+        """The network's input (B, newest + E) with the student's latent, which has no gradient."""
         seen = super().get_latent(obs, masks, hidden_state)
         with torch.no_grad():
             return join(seen, self._newest, self.estimator(seen))
 
     def rollout_latent(self, obs: TensorDict) -> Tensor:
-        return self._take_over(self.get_latent(obs), self.teacher(self._known(obs)), self.taught)
+        return self._take_over(self.get_latent(obs), self.teacher(self._known(obs)), self.teacher_worlds)
 
     @torch.no_grad()
-    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """What the two encoders read (B, ...), with columns of zeros up to a multiple of four, and who is taught (B, 1)."""
+    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """The encoders' inputs (B, ...), padded to a multiple of four columns, and whether the teacher acted (B, 1)."""
         seen, known = MLPModel.get_latent(self, obs), self.teacher[0](self._known(obs))
-        taught = self.taught.index_select(0, worlds).repeat(len(seen) // len(worlds), 1)
-        return *(nn.functional.pad(each, (0, -each.shape[1] % 4)) for each in (seen, known)), taught
+        by_teacher = self.teacher_worlds.index_select(0, worlds).repeat(len(seen) // len(worlds), 1)
+        return *(nn.functional.pad(each, (0, -each.shape[1] % 4)) for each in (seen, known)), by_teacher
 
-    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        seen, known, taught = lesson
+    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        seen, known, by_teacher = regression_batch
         wanted = run_mlp(self.teacher[1], known)
-        output = run_mlp(self.mlp, self._take_over(latent, wanted, taught))
+        output = run_mlp(self.mlp, self._take_over(latent, wanted, by_teacher))
         return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
@@ -97,11 +97,13 @@ class ConcurrentModel(RegressingModel):
     def _known(self, obs: TensorDict) -> Tensor:
         return torch.cat([obs[group] for group in self._groups], dim=-1)
 
-    def _take_over(self, own: Tensor, encoded: Tensor, taught: Tensor) -> Tensor:
-        """What the network reads (B, ...), with the teacher's latent where ``taught`` (B, 1)."""
+    def _take_over(self, own: Tensor, encoded: Tensor, by_teacher: Tensor) -> Tensor:
+        """The network's input (B, ...), with the teacher's latent where ``by_teacher`` (B, 1)."""
         stop = self._get_latent_dim()
         start = stop - self._size
-        return torch.cat([own[:, :start], torch.where(taught, unit(encoded), own[:, start:stop]), own[:, stop:]], dim=1)
+        return torch.cat(
+            [own[:, :start], torch.where(by_teacher, unit(encoded), own[:, start:stop]), own[:, stop:]], dim=1
+        )
 
     def as_onnx(self, verbose: bool) -> nn.Module:
         return _OnnxStudent(self)
@@ -129,7 +131,7 @@ class _OnnxStudent(nn.Module):
 
 
 def join(seen: Tensor, newest: list[tuple[int, int]], encoded: Tensor) -> Tensor:
-    """The ``newest`` columns of what is seen, and the latent beside them."""
+    """The ``newest`` columns of the observations, and the latent beside them."""
     return torch.cat([*(seen[:, start:stop] for start, stop in newest), unit(encoded)], dim=-1)
 
 
@@ -138,8 +140,8 @@ def unit(x: Tensor) -> Tensor:
     return nn.functional.normalize(x, dim=-1)
 
 
-def taught_worlds(worlds: int, share: float) -> Tensor:
-    """Which of N worlds act by the teacher's latent, (N, 1): always the same, and among neighbours some of both."""
+def pick_teacher_worlds(worlds: int, share: float) -> Tensor:
+    """The worlds that act by the teacher's latent (N, 1), the same in each run. Neighbours include both kinds."""
     return ((torch.arange(worlds, dtype=torch.float64) * _GOLDEN) % 1.0 < share)[:, None]
 
 

@@ -1,4 +1,4 @@
-"""rsl-rl's Distillation recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no question to the host.
+"""rsl-rl's Distillation recorded as CUDA graphs: the same keys, mathematics and checkpoints, no read from the device.
 
 A student learns to act like a teacher that sees more, in the states that the student's own actions lead to (DAgger).
 """
@@ -17,17 +17,17 @@ from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
-from legged_mw.rl.recorded import Memories, Recorded, why_stock
+from legged_mw.rl.ppo import Memories, Recorded, UpdateRollback, why_stock
 from legged_mw.rl.students.recurrent import step
-from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 
 
 class GraphedDistillation(Recorded, Distillation):
     """Distillation whose acting and update are replayed CUDA graphs.
 
-    What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer other than
-    Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. On a CPU nothing is recorded.
+    What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer
+    other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. On
+    a CPU nothing is recorded.
     """
 
     def __init__(self, student: MLPModel, teacher: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
@@ -43,28 +43,29 @@ class GraphedDistillation(Recorded, Distillation):
         self._obs = TensorDict(
             {name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device
         )
-        # what the teacher sees is not learned from
+        # the student learns from its own groups alone
         storage.observations = storage.observations.select(*student.obs_groups)
         self._loss = torch.zeros((), device=self.device)
-        self.undo = Undo(self, (self.student,))
+        self.rollback = UpdateRollback(self, (self.student,))
         self._begin()
 
     def _why_stock(self) -> str | None:
-        """What keeps this configuration from being recorded, or None."""
+        """Why this configuration cannot be recorded, or None."""
         if self.storage.num_transitions_per_env % self.gradient_length:
-            return f"gradient_length {self.gradient_length} does not divide a rollout of {self.storage.num_transitions_per_env} steps"
-        # a teacher's estimator learns nothing
+            steps = self.storage.num_transitions_per_env
+            return f"gradient_length {self.gradient_length} does not divide a rollout of {steps} steps"
+        # a teacher may have an estimator: it does not learn
         return why_stock(self, self.student, self.teacher, regressing=self.teacher)
 
     def _begin(self) -> None:
-        """Empty memories, and graphs that are not recorded yet."""
+        """Make empty memories, and graphs to be recorded at their next calls."""
         self._memories = Memories((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
         self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
 
     # ---- the rollout ----------------------------------------------------------------------------------------------
 
     def act(self, obs: TensorDict) -> Tensor:
-        """The student's sampled actions (N, A); the teacher's are noted until ``process_env_step``."""
+        """The student's sampled actions (N, A); the transition keeps the teacher's until ``process_env_step``."""
         if not self.graphed:
             return super().act(obs)
         if self.storage.step == 0:
@@ -81,7 +82,7 @@ class GraphedDistillation(Recorded, Distillation):
         self._acted = actions.detach(), wanted.detach()
 
     def _latent(self, model: MLPModel) -> Tensor:
-        """What a network's MLP reads; a memory takes in the observations."""
+        """The input of a network's MLP. A memory takes in the observations."""
         return self._memories[model].advance(self._obs) if model in self._memories else model.get_latent(self._obs)
 
     def _mean(self, model: MLPModel, latent: Tensor) -> Tensor:
@@ -91,7 +92,7 @@ class GraphedDistillation(Recorded, Distillation):
     # ---- the update -----------------------------------------------------------------------------------------------
 
     def update(self) -> dict[str, Any]:
-        """Epochs over the storage, step by step; returns the mean loss, a tensor () whose reading waits for the device."""
+        """Learn from the storage, step by step; returns the mean loss as a tensor ()."""
         if not self.graphed:
             return super().update()
         self.num_updates += 1
@@ -100,7 +101,7 @@ class GraphedDistillation(Recorded, Distillation):
         return {"behavior": self._loss.clone()}
 
     def _update(self) -> None:
-        self.undo.remember()
+        self.rollback.begin()
         st, memory = self.storage, self._memories.get(self.student)
         with torch.no_grad():
             seen = torch.cat([st.observations[group] for group in self.student.obs_groups], dim=-1).flatten(0, 1)
@@ -120,19 +121,21 @@ class GraphedDistillation(Recorded, Distillation):
                 self._gradient_step(latent, wanted.flatten(0, 1))
         self._loss /= self.num_learning_epochs * len(chunks)
         if memory and state is not None:
-            memory.now[:, 0].copy_(state)  # as in rsl-rl: of the student as it is now
+            memory.now[:, 0].copy_(state)  # as in rsl-rl: of the updated student
         if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
             with torch.no_grad():
                 update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
-        self.undo.settle(self._loss)
+        self.rollback.finish(self._loss)
 
     def _unroll(self, inputs: Tensor, ended: Tensor, state: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """What the student's MLP reads (S * N, size) of S steps (S, N, size), and its hidden state after them, detached.
+        """The inputs of the student's MLP (S * N, size) over S steps, and the hidden state after them, detached.
 
         ``ended`` (S, N, 1): the episode ended in that step.
         """
         if state is None or not isinstance(self.student, RNNModel):
-            return nn.functional.pad(inputs.flatten(0, 1), (0, -inputs.shape[2] % 4)), None  # what TF32 products want
+            return nn.functional.pad(
+                inputs.flatten(0, 1), (0, -inputs.shape[2] % 4)
+            ), None  # TF32 products want a multiple of 4
         seen = []
         for x, over in zip(inputs, ended, strict=True):
             latent, state = step(self.student.rnn.rnn, x, state)

@@ -1,8 +1,8 @@
 """An actor that reads its own estimate of what a robot cannot measure, and the regression that trains the estimator.
 
-The estimator goes from the actor's observations to rows that only the simulator knows. The policy reads the estimate beside its
-observations, but no gradient of the policy reaches the estimator, and none of the estimator the policy. During an update the policy
-reads the estimate that it acted with; the estimator learns beside it.
+The estimator goes from the actor's observations to rows that only the simulator knows. The policy reads the estimate
+beside its observations, but no gradient of the policy reaches the estimator, and none of the estimator the policy.
+During an update the policy reads the estimate that it acted with; the estimator learns beside it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from torch import Tensor, nn
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.network import ESTIMATE
-from legged_mw.rl.recorded import RegressingModel
+from legged_mw.rl.policies import ESTIMATE
+from legged_mw.rl.ppo import RegressingModel
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-SMALLEST = 0.01  # standard deviation of a target, in its unit, that counts: as rsl-rl's eps for observations
+SMALLEST = 0.01  # smallest standard deviation of a target, in its unit, as rsl-rl's eps for observations
 FIELD = "actor.estimator.targets"
 
 
@@ -37,7 +37,7 @@ class Target(NamedTuple):
 
 
 class TargetNormalizer(EmpiricalNormalization):
-    """Nothing is added to its standard deviation, so that an export can hold it as it is."""
+    """A normaliser without eps: an export holds its standard deviation unchanged."""
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self._mean) / self._std.clamp(min=SMALLEST)
@@ -76,20 +76,20 @@ class EstimatingModel(RegressingModel):
         return self.obs_dim + self._size
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """What the network reads (B, obs + E): the estimate comes without its gradient."""
+        """The network's input (B, obs + E); the estimate has no gradient."""
         seen = super().get_latent(obs, masks, hidden_state)
         with torch.no_grad():
             estimate = self.estimator(seen)
         return torch.cat([seen, estimate], dim=-1)
 
     @torch.no_grad()
-    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """The targets (B, E), normalised: what the estimator is to say."""
+    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """The normalised targets (B, E) of the estimator."""
         return (self.target_normalizer(self.truth(obs)),)
 
-    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """The estimator reads the first columns of the latent, the observations."""
-        return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), lesson[0])
+    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The estimator reads the first columns of ``latent``, the observations."""
+        return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), regression_batch[0])
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         update_normalizer(self.target_normalizer, self.truth(obs), ranks)
@@ -121,7 +121,7 @@ class EstimatingModel(RegressingModel):
 
 
 def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
-    """vx, vy (N, 2) [m/s] that ``policy`` believes of its robots; None if it does not estimate their velocity."""
+    """vx, vy (N, 2) [m/s] as ``policy`` estimates them; None if it does not."""
     columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None
     return None if columns is None else policy.estimate(obs)[:, columns][:, :2]
 
@@ -146,7 +146,7 @@ class _OnnxEstimatingModel(nn.Module):
         return actions, estimate * self.target_normalizer._std + self.target_normalizer._mean
 
 
-# ---- what the config means ------------------------------------------------------------------------------------------
+# ---- the config section ---------------------------------------------------------------------------------------------
 
 
 def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -
 
 
 def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:
-    """Each target and its row: of the critic's groups first, then of others, never of one that the actor reads. Raises ConfigError."""
+    """Each target and its row, from the critic's groups, then others, none that the actor reads. Raises ConfigError."""
     names, obs_groups, groups = (
         sections["actor"]["estimator"]["targets"],
         sections["obs_groups"],

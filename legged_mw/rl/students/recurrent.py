@@ -1,8 +1,9 @@
-"""GRU and LSTM networks in a recorded rollout and update, and what a policy with a memory needs wherever it acts.
+"""GRU and LSTM networks in a recorded rollout and update, and the hidden state of a policy wherever it acts.
 
-rsl-rl cuts a rollout into episodes and pads them to one length: a shape that depends on data. Here the network runs over the
-T steps of the rollout with all worlds side by side, and the state of a world becomes 0 before the step that begins an episode:
-the same values and gradients. cuDNN cannot change a state on the way, so each step is a product and a few kernels of its own.
+rsl-rl cuts a rollout into episodes and pads them to one length: a shape that depends on data. Here the network runs
+over the T steps of the rollout with all worlds side by side, and the state of a world becomes 0 before the step that
+begins an episode: the same values and gradients. cuDNN cannot change a state on the way, so each step is a product and
+a few kernels of its own.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
 from legged_mw.rl.layers import Linear, sum_rows
-from legged_mw.rl.network import MEMORY_INPUT, MEMORY_OUTPUT
-from legged_mw.rl.recorded import RememberingModel, Sequenced
+from legged_mw.rl.policies import MEMORY_INPUT, MEMORY_OUTPUT
+from legged_mw.rl.ppo import RememberingModel, Sequenced
 
 
 class SequenceInput(NamedTuple):
-    """What a recurrent network sees in an update: S is 2 with mirror images, else 1; B worlds over T steps."""
+    """Inputs of a recurrent network in an update: B worlds over T steps; S is 2 with mirror images, else 1."""
 
     inputs: Tensor  # (S, T, B, size), normalised
     state: Tensor  # (states, S, B, H), at the first step
@@ -31,8 +32,8 @@ class SequenceInput(NamedTuple):
 class HiddenState:
     """The state of a recurrent network in each of N worlds, in tensors that stay.
 
-    With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has no mirror image
-    of its own.
+    With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has
+    no mirror image of its own.
     """
 
     def __init__(self, model: RNNModel, worlds: int, images: int, device: str) -> None:
@@ -41,17 +42,17 @@ class HiddenState:
         self.start = torch.zeros_like(self.now)  # when the rollout began
 
     def advance(self, obs: Any) -> Tensor:
-        """Take in observations (N,), or (2N,) with their images; returns what the MLP reads (N, H)."""
+        """Take in observations (N,), or (2N,) with their mirror images; returns the MLP's input (N, H)."""
         seen, after = step(self._model.rnn.rnn, self.normalised(obs), self.now.flatten(1, 2))
         self.now.copy_(after.view_as(self.now))
         return seen[: self.now.shape[2]]
 
     def normalised(self, obs: Any) -> Tensor:
-        """What the recurrent part reads of observations (B,): (B, size)."""
+        """The recurrent layers' input (B, size) for observations (B,)."""
         return MLPModel.get_latent(self._model, obs)
 
     def forget(self, ended: Tensor) -> None:
-        """The state becomes 0 where ``ended`` (N,)."""
+        """Set the state to 0 where ``ended`` (N,)."""
         self.now.masked_fill_(ended.bool()[:, None], 0.0)
 
     def for_rsl_rl(self) -> Any:
@@ -60,7 +61,7 @@ class HiddenState:
         return parts[0] if len(parts) == 1 else parts
 
     def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> SequenceInput:
-        """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and where a step ended an episode, ``dones`` (T, N, 1)."""
+        """The rollout of ``worlds`` (B,), from ``inputs`` (S * T * B, size) and ``dones`` (T, N, 1) after each step."""
         ended = dones.index_select(1, worlds).to(inputs.dtype)
         keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
         return SequenceInput(
@@ -73,7 +74,7 @@ class HiddenState:
 
 
 class RecurrentModel(RememberingModel):
-    """The RNNModel of a config: rsl-rl's network, with a memory for recorded learners and an export whose state goes in and out."""
+    """rsl-rl's RNNModel, with a memory for recorded learners, and an export with the state as input and output."""
 
     def memory(self, worlds: int, images: int, device: str) -> HiddenState:
         return HiddenState(self, worlds, images, device)
@@ -100,7 +101,7 @@ class _OnnxRecurrentModel(nn.Module):
 
 
 def memory_of(policy: MLPModel, worlds: int) -> Tensor:
-    """What an rsl-rl network remembers (N, states, H), zeros at first; (N, 0, 0) without a memory."""
+    """The hidden state of an rsl-rl network (N, states, H), zeros at first; (N, 0, 0) without a memory."""
     held = policy.get_hidden_state()
     if held is None:
         return torch.zeros(worlds, *(states_of(policy) if isinstance(policy, RNNModel) else (0, 0)))
@@ -108,27 +109,27 @@ def memory_of(policy: MLPModel, worlds: int) -> Tensor:
 
 
 def states_of(model: RNNModel) -> tuple[int, int]:
-    """How many states it has, each layer's h, of an LSTM then each layer's c; and the size H of each."""
+    """Number of states (h of each layer, then c of each layer of an LSTM), and the size H of each."""
     rnn = model.rnn.rnn
     return rnn.num_layers * (2 if isinstance(rnn, nn.LSTM) else 1), rnn.hidden_size
 
 
 def forget(policy: Any, ended: Tensor | None = None) -> None:
-    """Tell a policy in which worlds (N,) an episode ended; None: in all. What has no memory has nothing to forget."""
+    """Clear the hidden state where ``ended`` (N,), or everywhere; a policy without a memory is left alone."""
     if getattr(policy, "is_recurrent", False):
         with torch.inference_mode():  # its state may have been made there
             policy.reset(ended)
 
 
 def with_own_state(policy: Any) -> Any:
-    """The same policy with a memory of its own; itself, if it has none."""
+    """A copy of the policy with a hidden state of its own; the policy itself if it has no memory."""
     if not getattr(policy, "is_recurrent", False):
         return policy
     return copy.deepcopy(policy).apply(lambda part: part.flatten_parameters() if isinstance(part, nn.RNNBase) else None)
 
 
 def step(rnn: nn.RNNBase, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-    """One step of a GRU or LSTM from inputs (N, size) and state (states, N, H): its output (N, H) and the next state."""
+    """One step of a GRU or LSTM: output (N, H) and next state, from inputs (N, size) and state (states, N, H)."""
     hidden, cells = [], []
     for layer, weights in enumerate(rnn.all_weights):
         if isinstance(rnn, nn.LSTM):
@@ -141,7 +142,7 @@ def step(rnn: nn.RNNBase, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def unroll(rnn: nn.RNNBase, sequence: SequenceInput) -> Tensor:
-    """The outputs (S * T * B, H) of a GRU or LSTM over a sequence; gradients reach back to the start of each episode or of the rollout."""
+    """The outputs (S * T * B, H) of a GRU or LSTM over a sequence. Gradients stop at the start of each episode."""
     x, state, keep = sequence
     layer_of: Callable[..., Tensor] = LSTM.apply if isinstance(rnn, nn.LSTM) else GRU.apply  # type: ignore[assignment]
     for layer, (into, onward, bias, onward_bias) in enumerate(rnn.all_weights):
@@ -150,8 +151,9 @@ def unroll(rnn: nn.RNNBase, sequence: SequenceInput) -> Tensor:
     return x.flatten(0, 2)
 
 
-# The two layers below take what torch's GRU and LSTM make of the inputs, (S, T, B, gates * H), and run the rest, the state's part,
-# step by step. In the backward pass the gradient of every gate is that of h (or c) times a factor: all factors are made at once.
+# The two layers below take the inputs' part of the gates, (S, T, B, gates * H), as in torch, and run the rest, the
+# state's part, step by step. In the backward pass the gradient of every gate is that of h (or c) times a factor: all
+# factors are made at once.
 
 
 class GRU(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Does ``legged_mw.deploy`` act as the environment does? Recorded steps, played through deploy's own controller and compared."""
+"""Compares ``legged_mw.deploy`` with the environment: recorded steps are played through deploy's own controller."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.network import MEMORY_OUTPUT, run_onnx
-from legged_mw.rl.policies import act
+from legged_mw.export.network import run_onnx
+from legged_mw.rl.policies import MEMORY_OUTPUT, act
 from legged_mw.rl.students.recurrent import forget, memory_of
 from legged_mw.sim.simulation import say_overflow
 from legged_mw.skills.motion_tracking import MotionTracking
@@ -29,26 +29,26 @@ TOLERANCE = 1e-4  # relative above 1: MJCF has six digits, and the environment c
 
 
 class ExportError(UserError, RuntimeError):
-    """A policy that cannot be exported; nothing was written."""
+    """The policy cannot be exported; nothing was written."""
 
 
 class Step(NamedTuple):
-    """One control step of N worlds, as the environment made it."""
+    """One control step of N worlds in the environment."""
 
     observation: np.ndarray  # (N, size) of the actor
     measured: Measurement
     commands: np.ndarray  # (N, C)
     actions: np.ndarray  # (N, D) of the policy, not clipped
-    taken: np.ndarray  # (N, D) that the environment got
-    targets: np.ndarray  # (N, D) [rad] that the motors got, by encoders that may be off; or torques [N m]
-    ended: np.ndarray  # (N,) the episode ended, so that nothing of the targets is left to see
+    taken: np.ndarray  # (N, D) actions of the environment
+    targets: np.ndarray  # (N, D) of the motors [rad], by encoders with an offset; or torques [N m]
+    ended: np.ndarray  # (N,) the episode ended, and the reset replaced the targets
     clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 where there is none
     frame: np.ndarray  # (N,) of the motion; 0 where there is none
-    memory: np.ndarray  # (N, states, H) what the policy remembered before it acted; (N, 0, 0) without a memory
+    memory: np.ndarray  # (N, states, H) the policy's state before it acted; (N, 0, 0) without a memory
 
 
 def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Contract, folder: Path) -> list[Step]:
-    """The policy at work in ``env``, with what a robot with the export in ``folder`` would measure.
+    """Record the policy in ``env``, with the measurements of a robot that runs the export in ``folder``.
 
     The last two worlds get large random actions on top, so that some actions are clipped and some robots fall.
     """
@@ -77,10 +77,10 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
 
 
 def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
-    """What the environment's robots would measure now.
+    """The present measurements of the environment's robots.
 
-    Deploy's own scene measures positions and velocities, in the state of the environment. What needs forces or contacts comes
-    from the environment, whose sensors are one physics step old and zero after a reset.
+    Deploy's own scene measures positions and velocities, in the state of the environment. What needs forces or contacts
+    comes from the environment, whose sensors are one physics step old and zero after a reset.
     """
     fleet.qpos[:], fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
     fleet.refresh()
@@ -106,7 +106,7 @@ def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
 
 
 def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) -> None:
-    """Play ``steps`` through deploy's controller. Raises ExportError at the first observation, memory or joint target that differs."""
+    """Play ``steps`` through deploy's controller. Raises ExportError for a different observation, memory or target."""
     recorded = iter(steps)
 
     def network(_: Any, memory: np.ndarray | None = None) -> Any:
@@ -144,16 +144,18 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
 
 
 def _compare(env: RobotTask, step: int, what: str, names: Sequence[Any], theirs: np.ndarray, ours: np.ndarray) -> None:
-    """Refuse the first value (world, column) that differs."""
+    """Raise ExportError for the first value (world, column) that differs."""
     wrong = np.argwhere(~(np.abs(ours - theirs) <= TOLERANCE * np.maximum(1.0, np.abs(theirs))))  # NaN too
     if not len(wrong):
         return
     world, column = wrong[0]
+    own = ", ".join(overridden(type(env))) or "no method"
     raise ExportError(
-        f"legged_mw.deploy would act otherwise than the environment: {what} {names[column]} is {theirs[world, column]:.6g} in the "
-        f"environment and {ours[world, column]:.6g} by {CONTRACT_FILE}, at step {step}. {type(env).__name__} overrides "
-        f"{', '.join(overridden(type(env))) or 'no method'}. State it where the contract can take it from: an action's scale and origin "
-        f"in section control, a row's scale in its Row, a value of your own as a row of another name with sensors=; nothing was written"
+        f"legged_mw.deploy would act otherwise than the environment: {what} {names[column]} is "
+        f"{theirs[world, column]:.6g} in the environment and {ours[world, column]:.6g} by {CONTRACT_FILE}, "
+        f"at step {step}. {type(env).__name__} overrides {own}. State it where the contract can take it from: "
+        "an action's scale and origin in section control, a row's scale in its Row, a value of your own as a row of "
+        "another name with sensors=; nothing was written"
     )
 
 
@@ -169,7 +171,7 @@ def own_ends(task: type[RobotTask]) -> tuple[str, ...]:
 
 
 def overridden(task: type[RobotTask]) -> list[str]:
-    """Methods of RobotTask or LeggedRobot that the task has its own of; rewards aside."""
+    """Methods of RobotTask or LeggedRobot that the task overrides, without rewards."""
     own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
     names = [
         name for kind in own for name, value in vars(kind).items() if callable(value) and hasattr(LeggedRobot, name)

@@ -1,28 +1,31 @@
-"""A robot with its ground, servos and named sensors as one MJCF text that needs no other file. Host only; nothing is stepped.
+"""A robot with ground, servos and named sensors as one MJCF text that needs no other file.
 
-Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is checked.
+Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is
+checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
 
 import mujoco
 import numpy as np
 
 from legged_mw.drawing.scene import with_scene
 from legged_mw.drawing.terrain_look import STEEP_LIGHT
-from legged_mw.rl.export_meshes import shorten
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError
 
-AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks
-HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
+AROUND = 1000.0  # width of the level ground around the steps [m]
+HOME = "home"  # keyframe with the start pose, and the servos holding it
 TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
 _OPTION = (
     *("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance"),
@@ -51,7 +54,7 @@ _CONTACT = (
 
 @dataclass(frozen=True)
 class Scene:
-    """The result of ``standalone``."""
+    """A scene as text, and its sensors."""
 
     xml: str
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
@@ -65,10 +68,10 @@ def standalone(
     camera: Sequence[float] = (),
     source: str = "",
 ) -> Scene:
-    """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
+    """``robot`` as MJCF text, with sensors for a controller, and ``qpos``, ``ctrl`` as keyframe "home".
 
-    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be written out.
-    Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
+    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be
+    written out. Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
     spec = with_scene(robot, camera)
     if files := [field.name for field in spec.hfields if field.file]:
@@ -97,10 +100,10 @@ def standalone(
 
 
 def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
-    """The scene of ``standalone`` on the level pieces of ``terrain``, as boxes; the robot starts at ``start``, x, y, z [m].
+    """The scene of ``standalone`` on boxes, the level pieces of ``terrain``; the robot starts at ``start`` [m].
 
-    Level ground surrounds them for ``AROUND``. Raises ModelError for slopes and noise, which are no level pieces, and for too
-    many pieces: as text, a height field would have some megabytes.
+    Level ground surrounds them for ``AROUND``. Raises ModelError for slopes and noise, which are no level pieces, and
+    for too many pieces: as text, a height field would have some megabytes.
     """
     spec = mujoco.MjSpec.from_string(xml)
     floor, (boxes, _, left) = spec.geom(GROUND), as_boxes(terrain)
@@ -136,7 +139,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
 
 
 def _class_of(spec: mujoco.MjSpec, name: str, box: mujoco.MjsGeom) -> mujoco.MjsDefault:
-    """The defaults called ``name``: what the first of its boxes has, but for place and size. It halves the file."""
+    """The defaults called ``name``, made from its first box without place and size. They halve the file."""
     found = spec.find_default(name)
     if not found:
         found = spec.add_default(name, spec.default)
@@ -146,7 +149,7 @@ def _class_of(spec: mujoco.MjSpec, name: str, box: mujoco.MjsGeom) -> mujoco.Mjs
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:
-    """Name the sensors of training, and add sensors for what training computes from the state; contacts keep training's sensors."""
+    """Quantity -> sensors; adds those that training computes from the state. Contacts keep training's sensors."""
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     taken = {sensor.name for sensor in spec.sensors}
 
@@ -171,7 +174,7 @@ def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[s
 
 
 def _write_out_files(spec: mujoco.MjSpec) -> None:
-    """Meshes that come from files become numbers in the text; pictures are dropped, as they are only looks."""
+    """Turn meshes from files into numbers in the text, and drop pictures, which are only looks."""
     pictures = {t.name for t in spec.textures if t.file or any(t.cubefiles)}
     for material in spec.materials:
         material.textures = ["" if name in pictures else name for name in material.textures]
@@ -193,7 +196,7 @@ def _write_out_files(spec: mujoco.MjSpec) -> None:
 
 
 def differences(trained: mujoco.MjModel, model: mujoco.MjModel) -> list[str]:
-    """Names of the physical fields in which ``model`` is another machine; visual geoms, sensors and keyframes do not count."""
+    """Names of the physical fields that differ; visual geoms, sensors and keyframes do not count."""
     wrong = [f"option {name}" for name in _OPTION if not _close(getattr(trained.opt, name), getattr(model.opt, name))]
     wrong += [name for name in _FIELDS if not _close(getattr(trained, name), getattr(model, name))]
     colliding = [np.flatnonzero(m.geom_contype | m.geom_conaffinity) for m in (trained, model)]
@@ -207,3 +210,50 @@ def differences(trained: mujoco.MjModel, model: mujoco.MjModel) -> list[str]:
 def _close(a: object, b: object) -> bool:
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     return a.shape == b.shape and bool(np.all(np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(a))))
+
+
+# ---- meshes that MuJoCo builds from some numbers, written as those numbers: as text, their vertices are most of an MJ
+
+_BUILT = ("vertex", "normal", "texcoord", "face", "facenormal", "facetexcoord")  # follow from the few numbers
+_PLACES = ("mesh_vertnum", "mesh_facenum", "mesh_vert", "mesh_pos", "mesh_quat", "geom_pos", "geom_quat", "geom_size")
+PLACE_TOLERANCE = 1e-5  # of places [m] and of quaternions: MuJoCo writes six digits
+
+
+def shorten(xml: str, source: str) -> str:
+    """``xml``, written by MuJoCo, with the few numbers of ``source`` for meshes that MuJoCo builds.
+
+    As it was, where that would be another model: a mesh may have been renamed, or come from a file that ``source``
+    includes.
+    """
+    short = xml
+    for name, numbers in built_meshes(source).items():
+        start = f"<mesh name={quoteattr(name)}"
+        element = re.search(rf"{re.escape(start)}[^>]*>", short)
+        if element and " vertex=" in element[0]:
+            left = re.sub(rf' ({"|".join(_BUILT)})="[^"]*"', "", element[0])
+            short = short.replace(element[0], left.replace(start, f"{start} {numbers}", 1), 1)
+    return short if short == xml or _same(short, xml) else xml
+
+
+def built_meshes(source: str) -> dict[str, str]:
+    """Mesh -> the attributes from which MuJoCo builds it, in the MJCF ``source``; none if that is no MJCF."""
+    try:
+        meshes = [
+            mesh for mesh in ElementTree.fromstring(source).iter("mesh") if mesh.get("name") and mesh.get("builtin")
+        ]
+    except ElementTree.ParseError:
+        return {}
+    wanted = ("builtin", "params")
+    return {
+        mesh.attrib["name"]: " ".join(f"{key}={quoteattr(mesh.attrib[key])}" for key in wanted if key in mesh.attrib)
+        for mesh in meshes
+    }
+
+
+def _same(short: str, xml: str) -> bool:
+    try:
+        new, old = (mujoco.MjModel.from_xml_string(text) for text in (short, xml))
+    except ValueError:
+        return False
+    pairs = [(getattr(new, field), getattr(old, field)) for field in _PLACES]
+    return all(a.shape == b.shape and np.allclose(a, b, rtol=0.0, atol=PLACE_TOLERANCE) for a, b in pairs)

@@ -1,7 +1,4 @@
-"""A policy's network as an ONNX file: writing it, halving it, running it, and reading its weights back.
-
-onnx is imported where a file is written or read: a training begins without.
-"""
+"""A policy's network as an ONNX file: written, stored at half precision, run."""
 
 from __future__ import annotations
 
@@ -16,25 +13,16 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from legged_mw.utils.config import ConfigError
+from legged_mw.rl.policies import MEMORY_INPUT, PREFIX
 
-INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"
-PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
-MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
-LEARNING_ONLY = "teacher."  # parameters that nothing needs to act
-# neither a mean action nor an estimate needs them
-UNWRITTEN = (
-    "distribution.",
-    LEARNING_ONLY,
-    *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")),
-)
+INPUT, OUTPUT = "obs", "actions"
 
 
 class ExportedPolicy(nn.Module):
     """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside.
 
-    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of one that
-    estimates, the estimate (N, E) comes out beside them.
+    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of
+    one that estimates, the estimate (N, E) comes out beside them.
     """
 
     policy: Any
@@ -57,7 +45,7 @@ class ExportedPolicy(nn.Module):
 def run_onnx(
     path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None
 ) -> np.ndarray:
-    """Actions (B, A), or another output, of the network in an ONNX file, by onnxruntime or where it is not installed onnx's evaluator."""
+    """Actions (B, A), or another output, of an ONNX file, by onnxruntime, or onnx's evaluator without it."""
     inputs = {INPUT: observations} | ({} if memory is None else {MEMORY_INPUT: memory})
     try:
         import onnxruntime
@@ -72,10 +60,10 @@ def run_onnx(
 
 
 def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A); see ``ExportedPolicy``."""
+    """Write one self-contained ONNX file, with ``obs`` (batch, size) as input and ``actions`` (batch, A) as output."""
     exported = ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
+        warnings.simplefilter("ignore")  # torch's exporter warns of its internals, and of missing torchvision
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             exported,
@@ -93,7 +81,7 @@ def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
 
 
 def _strip(path: Path) -> None:
-    """Drop what the exporter notes for debugging: stack traces, with the folders of the machine that it ran on."""
+    """Drop the exporter's notes for debugging: stack traces, with folders of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -105,7 +93,7 @@ def _strip(path: Path) -> None:
     for value in (*graph.input, *graph.output, *graph.value_info):
         for dim in value.type.tensor_type.shape.dim:
             if dim.dim_param:
-                dim.dim_param = "batch"  # the one free dimension, which the exporter names as it likes
+                dim.dim_param = "batch"  # the one free dimension, of any name
     onnx.save(model, path)
 
 
@@ -113,7 +101,7 @@ def _strip(path: Path) -> None:
 
 
 def _weights(policy: MLPModel) -> dict[str, nn.Parameter]:
-    """What is stored at half precision. Biases and the normalizer stay float32: they are few, and rounding them costs more."""
+    """The parameters stored at half precision. Biases and the normaliser stay float32: few, and rounding costs more."""
     return {name: parameter for name, parameter in policy.named_parameters() if parameter.dim() > 1}
 
 
@@ -124,7 +112,7 @@ def round_weights(policy: MLPModel) -> None:
 
 
 def halve(policy: MLPModel, path: Path) -> None:
-    """Store the weights of the rounded ``policy`` in ``path`` as float16, each with a Cast, so that all is computed in float32."""
+    """Store the weights of the rounded ``policy`` in ``path`` as float16, each with a Cast back to float32."""
     import onnx
     from onnx import numpy_helper
 
@@ -146,46 +134,3 @@ def halve(policy: MLPModel, path: Path) -> None:
     del graph.node[:]
     graph.node.extend(nodes)
     onnx.save(model, path)
-
-
-# ---- reading -------------------------------------------------------------------------------------------------------
-
-
-def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
-    """The parameters of ``policy`` by name, as an export wrote them to ``path``: bit for bit, so that it acts as the exported one.
-
-    The noise of exploration and the normalizer's count and variance are not in the file; ``policy`` keeps its own.
-    """
-    import onnx
-    from onnx import numpy_helper
-
-    try:
-        graph = onnx.load(path, load_external_data=False).graph
-        stored = {
-            each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer
-        }
-    except FileNotFoundError:
-        raise ConfigError(f"no policy at {path}") from None
-    except Exception:  # protobuf's or onnx's, by how the file is broken
-        raise ConfigError(f"{path} cannot be read as an ONNX network: it is damaged") from None
-    found = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
-    if not found:
-        names = ", ".join(list(stored)[:3]) or "none"
-        raise ConfigError(
-            f"{path} is no network that this project exported: its weights are called {names}, not {PREFIX}mlp.0.weight ..."
-        )
-    if MEAN in found and STD not in found:
-        found[STD] = _divisor(graph, stored, path) - getattr(policy.obs_normalizer, "eps", 0.0)
-    return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | found
-
-
-def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
-    """std + eps of the normalizer, which the exporter adds up and names as it likes: the network begins with (obs - mean) / divisor.
-
-    Less eps, rounded, plus eps, rounded, it is the same float32 again, as it was made by such a sum.
-    """
-    centred = [node.output[0] for node in graph.node if PREFIX + MEAN in node.input]
-    for node in graph.node:
-        if node.op_type == "Div" and node.input[0] in centred and node.input[1] in stored:
-            return stored[node.input[1]]
-    raise ConfigError(f"{path} is no network that this project exported: it does not begin with (obs - mean) / std")

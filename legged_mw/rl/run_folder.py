@@ -1,0 +1,257 @@
+"""Run folders: making and finding them, the lock of a training, and the checkpoints that it writes and prunes there."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Self
+
+try:
+    import fcntl
+except ImportError:  # Windows: no locks
+    fcntl = None
+
+from legged_mw.rl.checkpoint import save_whole, suffix_of, worlds_file
+from legged_mw.rl.ranks import Rank
+from legged_mw.rl.saved_config import of_project, somebodys
+from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.errors import shown, unknown
+from legged_mw.utils.files import check_folder, check_name, typed
+from legged_mw.utils.task import LoadedTask
+
+CONFIG_FILE = "config.yaml"
+LOCK_FILE = ".lock"
+
+
+def logs_folder() -> Path:
+    """The folder of all runs of all tasks: ``logs`` in the current folder."""
+    return Path.cwd() / "logs"
+
+
+def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
+    """The folder of a task's runs, or of the experiment ``name``. Raises UserError for a name that is not allowed."""
+    return logs_folder() / check_name(
+        name or task.train.runner.experiment_name or task.name, "the name of the experiment"
+    )
+
+
+def new_run(experiment: Path, run_name: str) -> Path:
+    """Make and return a run folder below ``experiment``, named by the time."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{run_name}" if run_name else "")
+    for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
+        folder = experiment / (stamp + suffix)
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            continue
+    raise ConfigError(f"cannot make a run folder {experiment / stamp}: a thousand of that name exist")
+
+
+def runs(experiment: Path) -> list[Path]:
+    """Readable run folders with a checkpoint, oldest first by the time of their newest checkpoint."""
+    found: dict[Path, int] = {}
+    for folder in experiment.glob("*"):
+        # a link to itself, a folder of another user, a checkpoint that is pruned at this moment
+        with contextlib.suppress(OSError):
+            if there := checkpoints(folder):
+                found[folder] = max(path.stat().st_mtime_ns for path in there.values())
+    return sorted(found, key=lambda folder: found[folder])
+
+
+def checkpoints(run: Path) -> dict[int, Path]:
+    """Iteration -> checkpoint of a run, in rising order."""
+    named = {path: re.fullmatch(r"model_(\d{1,18})\.pt", path.name) for path in run.glob("model_*.pt")}
+    return dict(sorted((int(match[1]), path) for path, match in named.items() if match and path.is_file()))
+
+
+def find_run(experiment: Path, name: str) -> Path:
+    """The run called ``name`` below ``experiment``, or at the path ``name``, or for "-1" the run last trained."""
+    found, given = runs(experiment), typed(name)
+    if name == "-1":
+        if not found:
+            raise ConfigError(
+                f"no run with a checkpoint in {experiment}; train first, or name another --experiment_name"
+            )
+        return check_folder(found[-1])
+    for folder in (experiment / name, given):
+        if folder.is_dir() and checkpoints(folder):
+            return check_folder(folder)
+    raise ConfigError(unknown("run with a checkpoint", name, [folder.name for folder in found], str(experiment)))
+
+
+def find_checkpoint(run: Path, iteration: int) -> Path:
+    """The checkpoint of ``run`` after ``iteration`` iterations, or for -1 the newest."""
+    found = checkpoints(run)
+    if not found:
+        raise ConfigError(f"no checkpoint model_<iteration>.pt in {run}")
+    if iteration == -1:
+        return list(found.values())[-1]
+    if iteration not in found:
+        raise ConfigError(f"no checkpoint {iteration} in {run}; there are: {', '.join(map(str, found))}")
+    return found[iteration]
+
+
+def task_of(run: Path, named: LoadedTask | None = None) -> str:
+    """The ``--task`` of a run: a task of the project, or a file that the task ``named`` is or extends.
+
+    No other file: a file is code, and the run may be a stranger's. Raises ConfigError that says what to type.
+    """
+    stored = load_yaml(run / CONFIG_FILE).get("task", "")
+    if not isinstance(stored, str) or not stored:
+        raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
+    if found := of_project(stored) or (named and named.file_called(Path(stored).name)):
+        return str(found)
+    extending = ", or a task that extends its config" if named else ""
+    raise ConfigError(f"{shown(run)} is of task {stored[:200]!r}, {somebodys(stored)}{extending}")
+
+
+def task_at(path: str) -> str:
+    """``task_of`` the run at the path that the user typed, or '' if there is no run."""
+    run = typed(path)
+    return task_of(check_folder(run)) if (run / CONFIG_FILE).is_file() else ""
+
+
+class RunLock:
+    """The lock of the process that trains in a folder. The system releases it however the process ends."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises ConfigError if another process has the lock, OSError if the folder cannot be written."""
+        self._folder, self._file = folder, open(folder / LOCK_FILE, "a+")  # noqa: SIM115 (open until it is released)
+        try:
+            if fcntl:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._file.seek(0)
+            owner = self._file.read().strip() or "another process"
+            self._file.close()
+            raise ConfigError(
+                f"{shown(folder)} is being trained by {owner}; wait for its end, stop it, or name another run"
+            ) from None
+        except OSError as error:  # a file system without locks
+            print(
+                f"WARNING: {shown(folder)} cannot be locked ({error.strerror}): do not resume it while it trains",
+                flush=True,
+            )
+
+    def begin(self) -> None:
+        """Write the owner into the lock, and delete half-written files of a killed process."""
+        self._file.truncate(0)
+        self._file.write(f"process {os.getpid()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+        self._file.flush()
+        sweep(self._folder)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
+    def release(self) -> None:
+        self._file.close()
+
+    def lost(self) -> bool:
+        """Whether somebody has deleted the folder and the lock in it."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
+
+
+class CheckpointWriter:
+    """Writes checkpoints and prunes old ones. If one cannot be written, it warns and the training goes on."""
+
+    def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:
+        """``keep``: number of newest checkpoints that stay, 0: all. ``prepare``: make a lost folder, return whether."""
+        self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
+        self.failed = ""  # why the newest checkpoint could not be written, or ''
+        self.written: Path | None = None  # the newest one that was written
+        self.moved = False  # the folder was made again
+
+    def write(
+        self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]
+    ) -> bool:
+        """Write worlds, then the checkpoint, then prune; returns whether the checkpoint is written."""
+        path = self.folder / f"model_{iteration}.pt"
+        try:
+            self.moved = self._prepare()
+            self._write_worlds(worlds, worlds_file(path, self._rank), path)
+            if self._rank.leads:
+                save_whole(checkpoint(), path)
+        except (OSError, MemoryError) as error:  # the file is composed in memory
+            self.failed = reason_of(error)
+            newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
+            print(
+                f"WARNING: checkpoint {path.name} cannot be written: {self.failed}; {newest}; going on in memory",
+                flush=True,
+            )
+            if not path.exists():
+                with contextlib.suppress(OSError):
+                    worlds_file(path, self._rank).unlink(missing_ok=True)  # useless, and the disk is full
+            return False
+        self.failed, self.written = "", path
+        with contextlib.suppress(OSError):
+            self._prune()
+        return True
+
+    def _write_worlds(self, worlds: Callable[[], dict[str, Any]], file: Path, checkpoint: Path) -> None:
+        """Write the worlds if there is room: they are many times as large as the checkpoint, which may fit without."""
+        try:
+            save_whole(worlds(), file, sync=False)  # its reader detects a file torn by a power cut
+        except (OSError, MemoryError) as error:
+            print(
+                f"WARNING: {file.name} cannot be written: {reason_of(error)}; from {checkpoint.name} worlds begin anew",
+                flush=True,
+            )
+
+    def _prune(self) -> None:
+        """Delete worlds of checkpoints before the newest, and the oldest checkpoints.
+
+        A rank that comes here before the first one has written the newest checkpoint leaves the worlds of the one
+        before. The first rank also deletes worlds of an earlier training with another number of processes.
+        """
+        there = checkpoints(self.folder)
+        newest, rank = max(there, default=0), self._rank
+        for old in self.folder.glob("worlds_*.pt"):
+            named = re.fullmatch(r"worlds_(\d+)((?:_\d+of(\d+))?)\.pt", old.name)
+            mine = named and (named[2] == suffix_of(rank) or (rank.leads and int(named[3] or 1) != rank.count))
+            if named and mine and int(named[1]) < newest:
+                old.unlink(missing_ok=True)
+        if self._keep and self._rank.leads:
+            for old in list(there.values())[: -self._keep]:
+                old.unlink(missing_ok=True)
+
+
+def reason_of(error: BaseException) -> str:
+    """Why a file could not be written: the system's reason, if a library's error hides one."""
+    first: BaseException | None = error
+    while first is not None and not isinstance(first, OSError):
+        first = first.__cause__ or first.__context__
+    if isinstance(first, OSError) and first.strerror:
+        return first.strerror
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def sweep(folder: Path) -> None:
+    """Remove what killed programs left half written in ``folder``: ``.NAME.PID.tmp`` of a process that is gone."""
+    for path in folder.glob(".*.tmp"):
+        name = re.fullmatch(r"\.(export|.+\.(?:pt|yaml))\.(\d{1,9})\.tmp", path.name)
+        if not name or _lives(int(name[2])):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
