@@ -118,7 +118,8 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
     if path.suffix != ".py" and name not in known:
         if path.is_file():
             kinds = f"a task's config file (.py) nor a robot ({', '.join(ROBOT_FILES)})"
-            raise ConfigError(f"{name} is neither {kinds}")
+            unzip = "; unzip it, and name the .xml that is in it" if path.suffix in (".mjz", ".zip") else ""
+            raise ConfigError(f"{name} is neither {kinds}{unzip}")
         raise ConfigError(f"{unknown('task', name, known, 'configs/')}; or give the path of a config file (.py)")
     if path.suffix != ".py":
         path = ROOT / "configs" / f"{name}.py"
