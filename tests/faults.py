@@ -24,7 +24,7 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import States
 from legged_mw.unitree.client import UnitreeRobot
-from legged_mw.unitree.codec import Message
+from legged_mw.unitree.codec import WireMessage
 from legged_mw.unitree.faults import Faults, parse_faults
 from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.link import RobotEnd, Wire
@@ -62,7 +62,7 @@ class Side:
         self.walking: float | None = None  # [s] when the policy began
         self.held: tuple[str, ...] | None = None  # buttons, from the fault on
         self.injected: float | None = None  # [s] when the fault began
-        self.still: Message | None = None  # what another robot sends
+        self.still: WireMessage | None = None  # what another robot sends
         self.tilted: float | None = None  # [s] when it was tilted by more than 60 degrees
         self._begun: float | None = None  # [s] of the first command
 
@@ -357,7 +357,7 @@ def answers_too(ahead: float = 0.0) -> Callable[[Side, float], None]:
 
     def fault(side: Side, since: float) -> None:
         if side.end is None and side.second:
-            side.end, side.still = side.second(), Message(side.sim._state.layout, side.sim._state.body)
+            side.end, side.still = side.second(), WireMessage(side.sim._state.layout, side.sim._state.body)
         if side.end and side.still:
             side.still["tick"] = max(1, round(1000 * (side.sim.time + ahead)))
             side.end.send(side.still.seal())

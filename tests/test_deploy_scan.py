@@ -21,7 +21,7 @@ from legged_mw.deploy.seal import sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.export.scene import among_steps
-from legged_mw.robot.mjcf import MOST_BYTES, Source, write_archive
+from legged_mw.robot.mjcf import MOST_BYTES, XmlSource, write_archive
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
@@ -191,7 +191,7 @@ def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
 def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(
     right: str, wrong: str, message: str, export: Path
 ) -> None:
-    text = Source(SHIPPED / TERRAIN_FILE).text
+    text = XmlSource(SHIPPED / TERRAIN_FILE).text
     assert right in text
     write_archive(export / TERRAIN_FILE, text.replace(right, wrong))
     seal(export)
@@ -206,7 +206,7 @@ def test_an_archive_holds_one_model_that_stands_alone(tmp_path: Path, monkeypatc
     write_archive(file, "<mujoco/>")
     first = file.read_bytes()
     write_archive(file, "<mujoco/>")
-    assert file.read_bytes() == first and Source(file, alone=True).text == "<mujoco />"
+    assert file.read_bytes() == first and XmlSource(file, alone=True).text == "<mujoco />"
     monkeypatch.chdir(tmp_path)  # where a model of a text would look for what it names
     (tmp_path / "other.xml").write_text("<mujoco/>")
     for text in (
@@ -215,7 +215,7 @@ def test_an_archive_holds_one_model_that_stands_alone(tmp_path: Path, monkeypatc
     ):
         write_archive(file, text)
         with pytest.raises(ValueError, match=r"it names (other.xml|m.obj); the model of an archive stands alone"):
-            Source(file)
+            XmlSource(file)
 
 
 def _zipped(file: Path, method: int, *names: str, text: str = "<mujoco/>") -> bytes:
@@ -236,11 +236,11 @@ def test_a_broken_archive_is_one_line(tmp_path: Path) -> None:
     for content in broken:
         file.write_bytes(content)
         with suppress(ValueError):  # a byte of a date is no harm
-            assert Source(file).text == "<mujoco />"
+            assert XmlSource(file).text == "<mujoco />"
     for content in broken[:5]:
         file.write_bytes(content)
         with pytest.raises(ValueError, match="no zip file that can be read: "):
-            Source(file)
+            XmlSource(file)
 
 
 @pytest.mark.parametrize(
@@ -259,11 +259,11 @@ def test_another_archive_is_refused(method: int, names: tuple[str, ...], tmp_pat
         ValueError,
         match=f"it holds {', '.join(names) or 'nothing'}; an export's holds model.xml alone, deflated and of 64 MiB",
     ):
-        Source(tmp_path / "terrain.mjz")
+        XmlSource(tmp_path / "terrain.mjz")
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
     _zipped(tmp_path / "terrain.mjz", zipfile.ZIP_DEFLATED, "model.xml", text=" " * (MOST_BYTES + 1))
     assert (tmp_path / "terrain.mjz").stat().st_size < 100_000
     with pytest.raises(ValueError, match="it holds model.xml; .* of 64 MiB at most"):
-        Source(tmp_path / "terrain.mjz")
+        XmlSource(tmp_path / "terrain.mjz")

@@ -32,7 +32,7 @@ from legged_mw.eval.peers import PEERS, best_of
 from legged_mw.eval.rollout import holding, roll_out
 from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.eval.rules import table as rules_table
-from legged_mw.rl.policies import Source
+from legged_mw.rl.policies import PolicySource
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
@@ -200,7 +200,9 @@ def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
 def test_the_common_range_in_training_and_in_deploy() -> None:
     """It goes before what the config says of the ranges and speeds; the rest of the section stays."""
     flags = argparse.Namespace(override=[], set=["exam.peer=go2", "exam.push_speeds=[2, 3]"])
-    graded = grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
+    graded = grading.prepare(
+        PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True
+    )
     asked = ExamRules.from_config(graded.task.cfg)
     assert asked.ranges == ((-0.5, 1.0), (-0.4, 0.4), (-1.0, 1.0)) and asked.push_vx == asked.transport_vx == 0.5
     assert asked.push_speeds == (2.0, 3.0) and asked.marks == (0.06, 0.06, 0.12)
@@ -210,8 +212,8 @@ def test_the_common_range_in_training_and_in_deploy() -> None:
     with pytest.raises(
         ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"
     ):
-        grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
-    rival = grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
+        grading.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
+    rival = grading.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
     report.ask_alike([graded.task, rival.task])  # a rival is asked what the first one is, whatever it knows of peers
     assert (
         ExamRules.from_config(rival.task.cfg) == asked and rival.task.cfg.env.num_envs == graded.task.cfg.env.num_envs

@@ -22,7 +22,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.snapshot import take_snapshot
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
-from legged_mw.rl.policies import Source, Trained
+from legged_mw.rl.policies import PolicySource, Trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.distillation import GraphedDistillation
@@ -516,7 +516,7 @@ def test_a_recorded_warm_up_ends(networks: dict) -> None:
 
 def test_a_students_iteration_never_waits_for_the_host() -> None:
     env, teacher = make_env(eager=False), load_task("go1_flat")
-    attach_teacher_observations(env, Trained(Source(Path(), Path("model_1.pt"), False), teacher))
+    attach_teacher_observations(env, Trained(PolicySource(Path(), Path("model_1.pt"), False), teacher))
     runner = make_runner(env, small_learner(), None, DEVICE, teacher.train)
     runner.learn(5)
     obs = env.get_observations()

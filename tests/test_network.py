@@ -83,7 +83,7 @@ def test_an_export_is_played_by_its_path(made: Path, tmp_path: Path) -> None:
     assert result.code == 0 and result.out.startswith(f"policy: {made}/policy.onnx\n"), result.err
     assert (tmp_path / "again/policy.onnx").read_bytes() == (made / "policy.onnx").read_bytes()
     task = load_task("go1_flat")
-    assert policies.find_rival(task, str(made)) == policies.Source(made, made / "policy.onnx", shipped=False)
+    assert policies.find_rival(task, str(made)) == policies.PolicySource(made, made / "policy.onnx", shipped=False)
 
 
 def test_half_precision_halves_the_file_and_acts_alike(exact: Path, half: tuple[Path, Exported]) -> None:

@@ -21,7 +21,7 @@ from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy.contract import read_contract
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.policies import Source, Trained, find_trained, load_policy
+from legged_mw.rl.policies import PolicySource, Trained, find_trained, load_policy
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
@@ -262,7 +262,7 @@ def test_an_exported_actor_has_a_normalizer_that_has_seen_much(student: Path) ->
 
 def seated(env: RobotTask, task: LoadedTask) -> torch.Tensor:
     """The observations that a policy of ``task`` is shown in ``env``, (N, size): a buffer of the step."""
-    attach_teacher_observations(env, Trained(Source(Path("run"), Path("run/model_1.pt"), False), task))
+    attach_teacher_observations(env, Trained(PolicySource(Path("run"), Path("run/model_1.pt"), False), task))
     return env.obs_buf[TEACHER]
 
 
@@ -422,7 +422,7 @@ CHANGES: dict[str, tuple[str | Callable[[LoadedTask], None], Any]] = {
 def test_a_policy_that_would_mean_something_else_is_refused(change: Any, value: Any, env: LeggedRobot) -> None:
     task = load_task("go1_flat")
     change(task) if callable(change) else task.set(change, value)
-    policy, groups = Trained(Source(Path("run"), Path("run/model_1.pt"), False), task), {*env.observations.groups}
+    policy, groups = Trained(PolicySource(Path("run"), Path("run/model_1.pt"), False), task), {*env.observations.groups}
     with pytest.raises(ConfigError, match="^run/model_1.pt "):
         attach_teacher_observations(env, policy)
     with pytest.raises(ConfigError, match="^run/model_1.pt "):
@@ -465,7 +465,7 @@ def test_a_network_of_other_rows_is_refused(student: Path, teacher: Path) -> Non
 def test_an_actor_of_other_rows_is_refused(env: LeggedRobot) -> None:
     task = load_task("go1_flat")
     task.set("observations.history", {"state.dof_pos": 2})
-    policy = Trained(Source(Path("run"), Path("run/model_1.pt"), False), task)
+    policy = Trained(PolicySource(Path("run"), Path("run/model_1.pt"), False), task)
     with pytest.raises(
         ConfigError,
         match=r"^run/model_1.pt: it reads .* dof_pos 12 x 2 frames, .*; the actor of go1_flat reads .*dof_pos 12,",

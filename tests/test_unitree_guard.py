@@ -23,7 +23,7 @@ import pytest
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import RobotError
 from legged_mw.unitree import client, clock, guard, link, program
-from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.faults import Faults, parse_faults
 from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.handset import Handset
@@ -570,7 +570,7 @@ def test_the_program_with_motors_in_another_order(domain: int) -> None:
 
 def test_a_served_robot_says_why_it_refuses(domain: int, capsys: pytest.CaptureFixture[str]) -> None:
     """Once for each kind of mistake, when it is made; the rest are counted."""
-    sim, command = served(domain), Message(LAYOUTS["unitree_go", "LowCmd_"])
+    sim, command = served(domain), WireMessage(LAYOUTS["unitree_go", "LowCmd_"])
     bodies = [command.seal()] * 3 + [command.body[:-1]] * 2
     command["head"], command["level_flag"] = LOW_LEVEL[:2], LOW_LEVEL[2]
     bodies += [command.body] * 2  # the checksum of before

@@ -18,7 +18,7 @@ from legged_mw.deploy.robot import RobotError, damped
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.unitree.client import UnitreeRobot, check_rows
-from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
 from legged_mw.unitree.robots import G1, GO2, H1
 from legged_mw.unitree.serve import Faults, SimulatedUnitree
@@ -75,7 +75,7 @@ def test_measurements_are_the_truth_by_name(domain: int) -> None:
     assert np.allclose(measured.joint_vel, sim.joint_vel, atol=1e-6)
     assert measured.gravity[1] == pytest.approx(-math.sin(0.4), abs=1e-5)
     assert measured.gravity[2] == pytest.approx(-math.cos(0.4), abs=1e-5)
-    message = Message(LAYOUTS["unitree_go", "LowState_"], sim._state.body)
+    message = WireMessage(LAYOUTS["unitree_go", "LowState_"], sim._state.body)
     assert message["motor_state.q"][GO2.motors["FL_calf_joint"]] == pytest.approx(0.02)
     assert message["motor_state.q"][12:].tolist() == [0.0] * 8
 
@@ -167,16 +167,16 @@ def test_a_robot_without_good_states_is_none(fault: str, said: str, domain: int)
 @pytest.mark.parametrize("simulated", [True, False])
 def test_states_without_a_checksum(simulated: bool) -> None:
     """unitree_mujoco's simulator in Python sends none, and no voltage. No robot may, nor a simulator that sent one."""
-    contract, state = read_contract(POLICIES / "go2_flat"), Message(LAYOUTS["unitree_go", "LowState_"])
+    contract, state = read_contract(POLICIES / "go2_flat"), WireMessage(LAYOUTS["unitree_go", "LowState_"])
     state["power_v"], state["imu_state.quaternion"] = 30.0, [1.0, 0.0, 0.0, 0.0]
     sealed, state["crc"] = state.seal(), 0
-    later = Message(state.layout, state.body)
+    later = WireMessage(state.layout, state.body)
     later["motor_state.q"], later["tick"], later["power_v"] = 0.7, 1, 0.0
     robot = UnitreeRobot(contract, Once(later.body), Received(sealed, 0.0), simulated=simulated, clock=lambda: 0.0)
     assert not robot.read().joint_pos.any() and robot.dropped == {"with a wrong checksum": 1}
     robot._owner = Once(later.seal())
     assert np.allclose(robot.read().joint_pos, 0.7) and robot.health().voltage == 0.0
-    bare, later["crc"], later["tick"] = Message(state.layout), 0, 2
+    bare, later["crc"], later["tick"] = WireMessage(state.layout), 0, 2
     bare["imu_state.quaternion"] = state["imu_state.quaternion"]
     if simulated:
         robot = UnitreeRobot(contract, Once(later.body), Received(bare.body, 0.0), simulated=True, clock=lambda: 0.0)
@@ -198,7 +198,7 @@ def test_commands(domain: int) -> None:
     robot.damp()
     robot.limp()
     slots = [GO2.motors[name] for name in both.contract.joints]
-    sent = [Message(LAYOUTS["unitree_go", "LowCmd_"], body) for body in owner.sent]
+    sent = [WireMessage(LAYOUTS["unitree_go", "LowCmd_"], body) for body in owner.sent]
     for message in sent:
         assert message.intact() and message["head"].tolist() == [0xFE, 0xEF] and message["level_flag"] == 0xFF
         assert message["motor_cmd.mode"].tolist() == [1] * 12 + [0] * 8 and not message["motor_cmd.dq"].any()
@@ -240,7 +240,7 @@ def test_targets_are_held_within_what_was_trained(domain: int) -> None:
     assert (low[knee], high[knee]) == (pytest.approx(-0.087267), pytest.approx(2.8798))
     owner = both.robot._owner = Once(b"")
     both.robot.write(both.safety.held(np.full(29, -9.0)))
-    sent = Message(LAYOUTS["unitree_hg", "LowCmd_"], owner.sent[0])
+    sent = WireMessage(LAYOUTS["unitree_hg", "LowCmd_"], owner.sent[0])
     assert np.allclose(sent["motor_cmd.q"][[G1.motors[name] for name in both.contract.joints]], low)
 
 
@@ -251,10 +251,10 @@ def test_h1_on_the_wire() -> None:
         joints=tuple(H1.motors),
         **{name: np.arange(19.0) for name in ("default_pose", "stiffness", "damping")},
     )
-    owner = Once(Message(LAYOUTS["unitree_go", "LowState_"]).seal())
+    owner = Once(WireMessage(LAYOUTS["unitree_go", "LowState_"]).seal())
     robot = UnitreeRobot(contract, owner, owner.receive(), clock=lambda: 0.0)
     robot.write(np.arange(19.0))
-    message = Message(LAYOUTS["unitree_go", "LowCmd_"], owner.sent[-1])
+    message = WireMessage(LAYOUTS["unitree_go", "LowCmd_"], owner.sent[-1])
     assert message["motor_cmd.mode"].tolist() == [10] * 9 + [0] + [1] * 10
     assert message["motor_cmd.q"][[9, 6, 19]].tolist() == [0.0, 6.0, contract.joints.index("left_elbow_joint")]
 
@@ -263,15 +263,15 @@ def test_the_simulated_robot_obeys_as_a_motor_does(domain: int) -> None:
     """Wrong messages move nothing; a motor's mode 0 and Unitree's stop values give no torque; the last command holds for ever."""
     both = pair("go2_flat", domain)
     sim, robot = both.sim, both.robot
-    command = Message(
+    command = WireMessage(
         LAYOUTS["unitree_go", "LowCmd_"], robot._command(q=both.contract.default_pose, kp=both.contract.stiffness)
     )
-    wrong = Message(command.layout, command.body)
+    wrong = WireMessage(command.layout, command.body)
     wrong["motor_cmd.kp"] = 99.0
-    low = Message(command.layout, command.body)
+    low = WireMessage(command.layout, command.body)
     low["level_flag"] = 0xEE
     for bad in (wrong.body, low.seal()):
-        sim._take(Message(command.layout, bad))
+        sim._take(WireMessage(command.layout, bad))
     assert sim.record.refused == 2 and not sim.acted["kp"].any()
     sim._take(command)
     both.steps(1.0)
@@ -336,7 +336,7 @@ def test_the_wrong_robot(domain: int) -> None:
 def test_more_motors_than_the_contracts_robot_has(domain: int) -> None:
     """The same messages, another robot: a Go2 with wheels at 12 to 15, or an H1."""
     both = pair("go2_flat", domain)
-    state = Message(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
+    state = WireMessage(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
     state["motor_state.q"] = state["motor_state.mode"] = np.arange(20) < 16
     with pytest.raises(
         RobotError,

@@ -19,7 +19,7 @@ from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import BUTTONS, RobotError
 from legged_mw.unitree import handset, idl, link
-from legged_mw.unitree.codec import LAYOUTS, STRUCTS, Message, crc32, fields
+from legged_mw.unitree.codec import LAYOUTS, STRUCTS, WireMessage, crc32, fields
 from legged_mw.unitree.faults import KINDS, Faults, parse_faults
 from legged_mw.unitree.remote import decode, encode
 from legged_mw.unitree.robots import G1, GO2, H1, check_body, machine_of, order
@@ -101,7 +101,7 @@ def test_bytes_are_those_of_the_generic_codec(key: tuple[str, str], size: int) -
     sample, layout = filled(key, np.random.default_rng(1)), LAYOUTS[key]
     data = bytes(sample.serialize())
     assert len(data) == layout.size + 4 == size
-    message, copy = Message(layout, data[4:]), Message(layout)
+    message, copy = WireMessage(layout, data[4:]), WireMessage(layout)
     for name in layout.index:
         copy[name] = message[name]
     assert copy.body == data[4:] == idl.RAW[key](copy.body).serialize()[4:]
@@ -114,7 +114,7 @@ def test_bytes_are_those_of_the_generic_codec(key: tuple[str, str], size: int) -
 @pytest.mark.parametrize("key", LAYOUTS, ids=str)
 def test_every_layout_is_the_generic_codecs(key: tuple[str, str]) -> None:
     sample, layout = filled(key, np.random.default_rng(2)), LAYOUTS[key]
-    message = Message(layout, bytes(sample.serialize())[4:])
+    message = WireMessage(layout, bytes(sample.serialize())[4:])
     values = np.concatenate([np.ravel(message[name]) for name in layout.index])
     assert sorted(values.tolist()) == sorted(flat(sample))
 
@@ -144,7 +144,7 @@ def test_the_checksum() -> None:
 def test_it_is_taken_of_the_struct_not_of_the_wire(key: tuple[str, str], size: int) -> None:
     """The compiler pads where the wire does not: a field that is set must lie where C++ has it."""
     layout = LAYOUTS[key]
-    message = Message(layout)
+    message = WireMessage(layout)
     assert layout.image_size == size and not message.intact()
     message.seal()
     assert message.intact()
@@ -155,7 +155,7 @@ def test_it_is_taken_of_the_struct_not_of_the_wire(key: tuple[str, str], size: i
 
 def test_a_known_checksum() -> None:
     """A command of G1, all motors on, kp 60, computed bit by bit over the struct as gcc lays it out."""
-    message = Message(LAYOUTS["unitree_hg", "LowCmd_"])
+    message = WireMessage(LAYOUTS["unitree_hg", "LowCmd_"])
     message["mode_machine"], message["motor_cmd.mode"], message["motor_cmd.kp"] = 5, 1, 60.0
     motor = np.zeros((35, 28), dtype=np.uint8)
     motor[:, 0] = 1
@@ -166,7 +166,7 @@ def test_a_known_checksum() -> None:
 
 def test_a_message_of_another_size() -> None:
     with pytest.raises(ValueError, match="a message of 3 bytes, not 808"):
-        Message(LAYOUTS["unitree_go", "LowCmd_"], b"abc")
+        WireMessage(LAYOUTS["unitree_go", "LowCmd_"], b"abc")
 
 
 # ---- motors and the remote

@@ -107,10 +107,10 @@ class Reader:
 
 def compile_scene(file: Path) -> Any:
     """The model in an export's scene. Raises ContractError."""
-    from legged_mw.robot.mjcf import Source, check_model  # which bring MuJoCo
+    from legged_mw.robot.mjcf import XmlSource, check_model  # which bring MuJoCo
 
     try:
-        model = Source(file, alone=True).spec().compile()
+        model = XmlSource(file, alone=True).spec().compile()
         check_model(model)
     except (ValueError, OSError) as error:
         raise ContractError(f"{file.name} is not a valid MJCF: {' '.join(str(error).split())}") from None

@@ -37,7 +37,7 @@ from legged_mw.deploy.contract import (
     target_range,
 )
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
-from legged_mw.robot.mjcf import Source, check_model
+from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
 
@@ -332,7 +332,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
         )
     part(folder, file)
     try:
-        spec = Source(folder / file, alone=True).spec()
+        spec = XmlSource(folder / file, alone=True).spec()
         for body in spec.bodies[1:] if whole else ():
             shapes = [geom for geom in body.geoms if geom.group == _SHAPES]
             for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():

@@ -12,7 +12,7 @@ from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
 from legged_mw.eval.rules import in_common
-from legged_mw.rl.policies import Source, introduce, load_policy
+from legged_mw.rl.policies import PolicySource, introduce, load_policy
 from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
@@ -25,7 +25,7 @@ from legged_mw.utils.task import LoadedTask
 class Graded(NamedTuple):
     """A policy and the tasks that it is graded in."""
 
-    source: Source
+    source: PolicySource
     trained: LoadedTask
     task: LoadedTask
     exam: Exam
@@ -35,7 +35,7 @@ class Graded(NamedTuple):
 Elsewhere = Callable[[Graded], list[tuple[str, dict[str, Any]]]]  # results by name
 
 
-def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
+def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
     """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first.
 
     ``elsewhere`` grades the first policy once more, on another physics.
@@ -53,7 +53,7 @@ def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace, e
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 
 
-def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace, common: bool = False) -> Graded:
+def prepare(source: PolicySource, trained: LoadedTask, args: argparse.Namespace, common: bool = False) -> Graded:
     """The trained task with what the exam changes, the user's overrides last.
 
     ``common``: in the one range that all published policies of the robot were asked.

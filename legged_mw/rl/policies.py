@@ -37,7 +37,7 @@ UNWRITTEN = (
 )
 
 
-class Source(NamedTuple):
+class PolicySource(NamedTuple):
     """The files of a policy."""
 
     folder: Path  # holds its config
@@ -51,7 +51,7 @@ class Source(NamedTuple):
 
 def find_policy(
     task: LoadedTask, run: str | None = None, checkpoint: int = -1, experiment: str | None = None
-) -> Source:
+) -> PolicySource:
     """The named run or export, else the last run, else the policy that ships with the task."""
     folder = experiment_folder(task, experiment)
     if run == "shipped":
@@ -64,7 +64,7 @@ def find_policy(
 class Trained(NamedTuple):
     """A policy of another run, and its task as it was trained."""
 
-    source: Source
+    source: PolicySource
     task: LoadedTask
 
 
@@ -76,7 +76,7 @@ def find_trained(name: str, experiment: Path, flag: str, learner: LoadedTask | N
     path, (task, _, run) = typed(name), name.partition("/")
     try:
         if path.is_file():
-            source = Source(path.parent, path, shipped=False)
+            source = PolicySource(path.parent, path, shipped=False)
         elif task in task_names():
             source = find_policy(load_task(task), run or None)
         else:
@@ -88,7 +88,7 @@ def find_trained(name: str, experiment: Path, flag: str, learner: LoadedTask | N
         ) from None
 
 
-def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Source:
+def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> PolicySource:
     """The policy that ``--compare`` names; it must be of the same task."""
     if run == "shipped":
         return shipped_policy(task, "--compare shipped: ")
@@ -101,33 +101,33 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Sou
     return rival
 
 
-def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> Source:
+def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> PolicySource:
     """A run by its name or path, or an export by its path."""
     folder = typed(name)
     finish_moving(folder)  # of an export that was killed
     if (folder / NETWORK_FILE).is_file():
-        return Source(check_folder(folder), folder / NETWORK_FILE, shipped=False)
+        return PolicySource(check_folder(folder), folder / NETWORK_FILE, shipped=False)
     found = find_run(experiment, name)
-    return Source(found, find_checkpoint(found, checkpoint), shipped=False)
+    return PolicySource(found, find_checkpoint(found, checkpoint), shipped=False)
 
 
-def shipped_policy(task: LoadedTask, flag: str) -> Source:
+def shipped_policy(task: LoadedTask, flag: str) -> PolicySource:
     """The policy that ships with the task. The ConfigError begins with ``flag`` and lists the policies that ship."""
     folder = ROOT / "resources" / "policies" / task.name
     if not (folder / NETWORK_FILE).is_file():
         there = ", ".join(sorted(path.parent.name for path in folder.parent.glob(f"*/{NETWORK_FILE}")))
         raise ConfigError(f"{flag}no policy ships with {task.name}; those that ship: {there or 'none'}")
-    return Source(folder, folder / NETWORK_FILE, shipped=True)
+    return PolicySource(folder, folder / NETWORK_FILE, shipped=True)
 
 
-def load_trained(name: str, source: Source) -> LoadedTask:
+def load_trained(name: str, source: PolicySource) -> LoadedTask:
     """The task called ``name`` with the config that the policy was trained with."""
     task, config = load_task(name), source.folder / CONFIG_FILE
     update_from_run(task, load_yaml(config), where=shown(config))
     return task
 
 
-def introduce(source: Source, changes: dict[str, tuple[Any, Any]]) -> None:
+def introduce(source: PolicySource, changes: dict[str, tuple[Any, Any]]) -> None:
     """Print the policy, and changes of the config that it was trained with."""
     print(f"{'shipped policy' if source.shipped else 'policy'}: {shown(source.checkpoint)}")
     for path, (before, now) in sorted(changes.items()):

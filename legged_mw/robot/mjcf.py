@@ -48,7 +48,7 @@ _OF_URDF = ("mesh", "texture", "compiler")  # elements of a URDF with files that
 _NAMES = ("name", "class", "childclass", "model", "file", "dir", *_DIRS)
 
 
-class Source:
+class XmlSource:
     """A robot's file with the files that it includes and attaches. Raises ValueError for things that no robot needs.
 
     ``alone``: no file outside of its own folder is allowed. Otherwise meshes and textures may lie elsewhere.
@@ -122,7 +122,7 @@ class Source:
 class _Reader:
     """Builds the tree of one file, without comments and text. Raises ValueError with the line."""
 
-    def __init__(self, source: Source, path: Path, folder: str) -> None:
+    def __init__(self, source: XmlSource, path: Path, folder: str) -> None:
         self.source, self.path, self.folder = source, path, folder  # folder: of the model to which the file belongs
         self.file = "" if path == source.file else f"{path.name}: "
         self.builder, self.parser = TreeBuilder(), expat.ParserCreate("utf-8")

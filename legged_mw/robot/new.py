@@ -18,7 +18,7 @@ import mujoco
 
 from legged_mw.robot.draft import Draft, parents, values
 from legged_mw.robot.meshes import path_of
-from legged_mw.robot.mjcf import Source
+from legged_mw.robot.mjcf import XmlSource
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.robot_file import naming
 from legged_mw.utils.errors import UserError, shown
@@ -185,7 +185,7 @@ def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
 
 def stands_alone(file: Path) -> bool:
     """Whether ``file`` is an MJCF that needs no other file: then a copy of it is the robot."""
-    source = Source(file)
+    source = XmlSource(file)
     return source.root.tag == "mujoco" and not source.named
 
 
@@ -200,7 +200,7 @@ def as_mjcf(name: str, file: Path, folder: Path) -> str:
     spec.comment = f"\n    {name}: facts of the machine, from {file.name}. Ground, servos and sensors are added where it is loaded.\n  "
     with naming(file):
         spec.compile()
-        paths = _name_files(spec, Source(file).folders)
+        paths = _name_files(spec, XmlSource(file).folders)
         text = spec.to_xml()
     for path in paths:
         text = text.replace(f'"{escape(str(path))}"', f'"{escape(os.path.relpath(path, folder.resolve()))}"')

@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 import mujoco
 
 from legged_mw.robot.meshes import READABLE, why_unreadable
-from legged_mw.robot.mjcf import Source
+from legged_mw.robot.mjcf import XmlSource
 from legged_mw.utils.errors import ModelError
 
 _KNOWN = ("link", "joint", "material", "mujoco")  # what the reader needs; the rest is for other programs
@@ -20,7 +20,7 @@ _COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "fals
 SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
 
 
-def read_urdf(source: Source, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
+def read_urdf(source: XmlSource, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
     """The spec, every link a body of its own, and joint -> speed limit [rad/s].
 
     Its tree is changed for that. Raises ValueError for what is no URDF, ModelError for a mesh that collides and cannot be read.

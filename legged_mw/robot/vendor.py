@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.robot.meshes import compile_readable
-from legged_mw.robot.mjcf import Source, check_model
+from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.robot.urdf import read_urdf
 from legged_mw.sim.robot_file import (
     SCALAR_JOINTS,
@@ -54,7 +54,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         raise ModelError(f"no {kind_of(file)} at {file}")
     where, notes = file.name, []
     with naming(file):
-        source = Source(file)
+        source = XmlSource(file)
         spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = _take_limits(spec, notes)

@@ -17,7 +17,7 @@ from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.unitree import clock, need_dds
-from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.remote import decode
 from legged_mw.unitree.robots import Machine, check_body, check_slots, machine_of, order
 
@@ -125,8 +125,8 @@ class UnitreeRobot(Robot):
         each = self.machine.package == "unitree_hg"  # each motor says it
         return float(np.median(self._state["motor_state.vol"][self._slots])) if each else float(self._state["power_v"])
 
-    def _decoded(self, body: bytes) -> Message:
-        return Message(LAYOUTS[self.machine.package, "LowState_"], body)
+    def _decoded(self, body: bytes) -> WireMessage:
+        return WireMessage(LAYOUTS[self.machine.package, "LowState_"], body)
 
     def read(self) -> Measurement:
         self._listen()
@@ -222,7 +222,7 @@ class UnitreeRobot(Robot):
 
     def _command(self, **parts: Floats) -> bytes:
         """A sealed command: ``parts`` (D,) of the joints, zero where not given."""
-        machine, command = self.machine, Message(LAYOUTS[self.machine.package, "LowCmd_"])
+        machine, command = self.machine, WireMessage(LAYOUTS[self.machine.package, "LowCmd_"])
         used = np.isin(np.arange(machine.slots), self._slots)
         command["motor_cmd.mode"] = np.where(used, [machine.modes.get(i, 1) for i in range(machine.slots)], 0)
         for name, values in parts.items():

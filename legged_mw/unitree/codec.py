@@ -119,7 +119,7 @@ LAYOUTS = {
 }
 
 
-class Message:
+class WireMessage:
     """One message as the bytes that travel; ``message["motor_state.q"]`` is the field of all motors, in a copy."""
 
     def __init__(self, layout: Layout, body: bytes | None = None) -> None:

@@ -22,7 +22,7 @@ from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.robot import Floats, damped
 from legged_mw.deploy.safety import limits_of
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.faults import NAN, SWAPS, Faults, Line
 from legged_mw.unitree.remote import encode
 from legged_mw.unitree.robots import Machine, machine_of, order
@@ -110,7 +110,7 @@ class SimulatedUnitree:
         self.data, self.remote = mujoco.MjData(self.model), encode()
         self._slots, self._state = (
             order(self.machine, contract.joints),
-            Message(LAYOUTS[self.machine.package, "LowState_"]),
+            WireMessage(LAYOUTS[self.machine.package, "LowState_"]),
         )
         self.reset()
         # the body that the rope holds: of a G1 in the air its torso
@@ -124,7 +124,7 @@ class SimulatedUnitree:
         """Put it into its first keyframe, limp, ``after`` seconds from now, nothing under way to it: its clock and its record go on."""
         time = self.time + after
         self._in, self._out, self._last = Line(self._rng), Line(self._rng), -math.inf
-        self.command: Message | None = None  # the last one that was taken
+        self.command: WireMessage | None = None  # the last one that was taken
         self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) what the motors obey
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         self.data.qpos[2] += self._lift
@@ -196,7 +196,7 @@ class SimulatedUnitree:
         """One message of the wire; it may be anything."""
         layout = LAYOUTS[self.machine.package, "LowCmd_"]
         if len(body) == layout.size:
-            self._take(Message(layout, body))
+            self._take(WireMessage(layout, body))
         else:
             self._refuse("size", f"a command of {len(body)} bytes, not {layout.size}")
 
@@ -204,7 +204,7 @@ class SimulatedUnitree:
         self.record.refused += 1
         self.record.why.setdefault(kind, why)
 
-    def _take(self, command: Message) -> None:
+    def _take(self, command: WireMessage) -> None:
         """Obey a command from now on, if it is one."""
         if self.machine.package == "unitree_go":
             kind, said, wanted = (
@@ -224,7 +224,7 @@ class SimulatedUnitree:
         else:
             self._accept(command)
 
-    def _accept(self, command: Message) -> None:
+    def _accept(self, command: WireMessage) -> None:
         slots, signs = self._plugs()
         on, signs = command["motor_cmd.mode"][slots] != 0, {"q": signs, "dq": signs, "tau": signs}
         acted = {name: np.where(on, command[f"motor_cmd.{name}"][slots] * signs.get(name, 1.0), 0.0) for name in _PARTS}

@@ -1,6 +1,7 @@
 """A motor as a small neural network: from a joint's recent position errors and speeds to its torque.
 
-The same network serves each joint. It is read from an .npz without running code; envs/motors.py and deploy/contract.py evaluate it.
+All joints share one network. It is read from an .npz without running code; envs/motors.py and deploy/contract.py
+run it.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import torch
 
 from legged_mw.rl.checkpoint import load_tensors
 from legged_mw.rl.flags import require_task
-from legged_mw.rl.policies import Source, actor_in, introduce, load_policy
+from legged_mw.rl.policies import PolicySource, actor_in, introduce, load_policy
 from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
@@ -98,7 +98,9 @@ def parse(description: str | None) -> argparse.Namespace:
     return args
 
 
-def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> tuple[LoadedTask, tuple[Command, ...]]:
+def prepare(
+    source: PolicySource, trained: LoadedTask, args: argparse.Namespace
+) -> tuple[LoadedTask, tuple[Command, ...]]:
     """The trained task with what playing changes, the user's overrides last, and its commands as trained; prints the changes."""
     task = copy.deepcopy(trained)
     config = task.to_dict()
@@ -141,7 +143,7 @@ def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
     }
 
 
-def watch(source: Source, task: LoadedTask, commands: tuple[Command, ...], args: argparse.Namespace) -> None:
+def watch(source: PolicySource, task: LoadedTask, commands: tuple[Command, ...], args: argparse.Namespace) -> None:
     """Show the policy in the environment of the task as it is played; ``commands`` have their ranges as trained."""
     device = pick_device(args.device)
     seed_everything(task.train.seed)

@@ -18,7 +18,7 @@ from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.drawing.scene import visual_model
 from legged_mw.export.scene import standalone
-from legged_mw.robot.mjcf import Source, write_archive
+from legged_mw.robot.mjcf import XmlSource, write_archive
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import read_file
 from legged_mw.utils.errors import ModelError
@@ -280,7 +280,7 @@ def test_what_a_simulators_plugin_names_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "robot.urdf").write_text(
         PLAIN.replace("</robot>", '<gazebo><plugin filename="/dev/null"/></gazebo></robot>')
     )
-    assert Source(tmp_path / "robot.urdf").spec().compile().nbody > 1
+    assert XmlSource(tmp_path / "robot.urdf").spec().compile().nbody > 1
 
 
 @pytest.mark.parametrize(("text", "says"), [entry[1:] for entry in URDFS], ids=[entry[0] for entry in URDFS])
@@ -414,7 +414,7 @@ def test_scenes_that_name_other_files(reader: str, model: str, tmp_path: Path) -
 def test_text_between_elements_is_nothing(more: str, tmp_path: Path) -> None:
     """Its cost is that of reading it."""
     write_archive(tmp_path / "robot.mjz", GO1.replace("<worldbody>", f"{more}<worldbody>"))
-    assert Source(tmp_path / "robot.mjz", alone=True).text == Source(ROOT / "resources/robots/go1/go1.xml").text
+    assert XmlSource(tmp_path / "robot.mjz", alone=True).text == XmlSource(ROOT / "resources/robots/go1/go1.xml").text
 
 
 TOY = (
@@ -455,7 +455,7 @@ def test_parts_are_found_as_mujoco_finds_them_and_read_once(tmp_path: Path) -> N
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     theirs = mujoco.MjSpec.from_file(str(tmp_path / "robot.xml"))  # pyright: ignore[reportAttributeAccessIssue]
-    source = Source(tmp_path / "robot.xml")
+    source = XmlSource(tmp_path / "robot.xml")
     for name in files:
         (tmp_path / name).write_text("<mujoco/>")
     ours = source.spec()

@@ -24,7 +24,7 @@ from legged_mw.deploy.robot import QUANTITIES, Floats, Health, Measurement, Robo
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.unitree import remote
 from legged_mw.unitree.client import UnitreeRobot
-from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.serve import SimulatedUnitree
 from legged_mw.view.drive import Pilot
@@ -444,14 +444,14 @@ def state() -> bytes:
 
 
 def changed(state: bytes, seal: bool = True, **parts: Any) -> bytes:
-    message = Message(LAYOUTS["unitree_go", "LowState_"], state)
+    message = WireMessage(LAYOUTS["unitree_go", "LowState_"], state)
     for name, value in parts.items():
         message[name.replace("__", ".")] = value
     return message.seal() if seal else message.body
 
 
 def tick(state: bytes) -> int:
-    return int(Message(LAYOUTS["unitree_go", "LowState_"], state)["tick"])
+    return int(WireMessage(LAYOUTS["unitree_go", "LowState_"], state)["tick"])
 
 
 STATES = [
@@ -505,8 +505,8 @@ def test_a_whole_state_that_cannot_be_ends_the_walk(parts: dict[str, Any], says:
     assert trip is not None and says in trip.text
 
 
-def command(**parts: Any) -> Message:
-    message = Message(LAYOUTS["unitree_go", "LowCmd_"])
+def command(**parts: Any) -> WireMessage:
+    message = WireMessage(LAYOUTS["unitree_go", "LowCmd_"])
     message["head"], message["level_flag"], message["motor_cmd.mode"] = (0xFE, 0xEF), 0xFF, 1
     for name, value in parts.items():
         message[f"motor_cmd.{name}"] = value

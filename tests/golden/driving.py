@@ -30,7 +30,7 @@ from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.unitree import link, need_dds
 from legged_mw.unitree.client import Direct, UnitreeRobot, check_rows
-from legged_mw.unitree.codec import LAYOUTS, Message
+from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.robots import G1, GO2, check_body, machine_of
 
@@ -56,8 +56,8 @@ class Owner:
     def send(self, body: bytes, stamp: float, safe: bool) -> None: ...
 
 
-def state(**parts: Any) -> Message:
-    message = Message(STATE)
+def state(**parts: Any) -> WireMessage:
+    message = WireMessage(STATE)
     for name, value in {"tick": 5000, **parts}.items():
         message[name] = value
     return message
@@ -84,7 +84,7 @@ def another_body() -> None:
     contract = read_contract(ROOT / "resources/policies/g1_flat")
     bodies = []
     for number in (5, 4):
-        message = Message(LAYOUTS["unitree_hg", "LowState_"])
+        message = WireMessage(LAYOUTS["unitree_hg", "LowState_"])
         message["mode_machine"] = number
         bodies.append(message.seal())
     made = UnitreeRobot(contract, owner := Owner(), Received(bodies[0], 0.0), clock=lambda: 0.0)

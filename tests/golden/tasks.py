@@ -21,7 +21,7 @@ from legged_mw.envs.mirror import Mirror
 from legged_mw.eval.crossing import make_room
 from legged_mw.eval.exams import find_exam, require_exam
 from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.rl.policies import Source, Trained, find_rival
+from legged_mw.rl.policies import PolicySource, Trained, find_rival
 from legged_mw.rl.ranks import Rank, rank_device
 from legged_mw.rl.rsl_rl_settings import mirror
 from legged_mw.rl.runner import make_runner
@@ -104,7 +104,7 @@ def leaning(**angles: float) -> Mirror:
 def other(change: Any, value: Any, seat: Any) -> None:
     task = load_task("go1_flat")
     change(task) if callable(change) else task.set(change, value)
-    seat(env(), Trained(Source(Path("run"), Path("run/model_1.pt"), False), task))
+    seat(env(), Trained(PolicySource(Path("run"), Path("run/model_1.pt"), False), task))
 
 
 def begins(env: LeggedRobot, policy: Trained) -> None:
