@@ -188,9 +188,9 @@ def test_a_network_that_cannot_be_traced(made: Path, tmp_path: Path, monkeypatch
 def test_a_nan_is_a_mismatch() -> None:
     actions = np.zeros((3, 2))
     with pytest.raises(ExportError, match="acts otherwise"):
-        exporting._compare(np.full((3, 2), np.nan), actions)
+        exporting._check_network(np.full((3, 2), np.nan), actions)
     with pytest.raises(ExportError, match="acts otherwise"):
-        exporting._compare(np.zeros((1, 2)), actions)
+        exporting._check_network(np.zeros((1, 2)), actions)
 
 
 def test_without_onnxruntime(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:

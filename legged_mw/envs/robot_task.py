@@ -165,7 +165,7 @@ class RobotTask(BaseTask):
 
     def _end_step(self) -> None:
         """Keep values for the next step, after the reward has read this step's."""
-        if "last_last_actions" in vars(self):
+        if "action_smoothness" in self.reward_names:
             self.last_last_actions.copy_(self.last_actions)
         if self.last_dof_vel is not None:
             self.last_dof_vel.copy_(self.dof_vel)

@@ -51,7 +51,7 @@ FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract l
 SOMETIMES = (TERRAIN_FILE, MOTORS_FILE, MOTION_FILE)
 ONCE = ("terrain.xml",)  # files of older exports
 WORLDS = 8  # of the rollout for the comparison
-TOLERANCE = 1e-4  # of actions, relative above 1: float32 sums in another order
+NETWORK_TOLERANCE = 1e-4  # of actions, relative above 1: float32 sums in another order
 
 
 class Exported(NamedTuple):
@@ -128,9 +128,9 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         )
         remembered = np.concatenate([step.memory for step in steps]) if memory else None
         acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
-        gap = _compare(acted, np.clip(actions, -clip, clip))
+        gap = _check_network(acted, np.clip(actions, -clip, clip))
         if isinstance(policy, EstimatingModel):
-            _compare(
+            _check_network(
                 run_onnx(new / NETWORK_FILE, observations, ESTIMATE),
                 _run(policy, clip, observations)[1],
                 does="estimates",
@@ -184,13 +184,13 @@ def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
     )
 
 
-def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
+def _check_network(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
     """The largest difference. Raises ExportError if the network acts or estimates otherwise than the policy."""
     gap = _gap(got, wanted)
-    if not gap <= TOLERANCE:  # NaN too
+    if not gap <= NETWORK_TOLERANCE:  # NaN too
         raise ExportError(
             f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on "
-            f"{len(wanted)} recorded observations (at most {TOLERANCE:g} is allowed); nothing was written"
+            f"{len(wanted)} recorded observations (at most {NETWORK_TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
 

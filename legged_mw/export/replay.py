@@ -25,7 +25,7 @@ from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.errors import UserError
 
 STEPS = 32
-TOLERANCE = 1e-4  # relative above 1: MJCF has six digits, and the environment computes in float32
+CONTRACT_TOLERANCE = 1e-4  # relative above 1: MJCF has six digits, and the environment computes in float32
 
 
 class ExportError(UserError, RuntimeError):
@@ -125,14 +125,14 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
         for row in contract.rows:
             columns = slice(start, start := start + row.size * row.history)
             what = f"observation row '{row.name}'"
-            _compare(
+            _check_equal(
                 env, number, what, range(row.size * row.history), step.observation[:, columns], observed[:, columns]
             )
         if controller.memory is not None:
             flat = step.memory.reshape(env.num_envs, -1)
-            _compare(env, number, "memory", range(flat.shape[1]), flat, controller.memory.reshape(flat.shape))
+            _check_equal(env, number, "memory", range(flat.shape[1]), flat, controller.memory.reshape(flat.shape))
         controller.act(step.measured, step.commands)
-        _compare(
+        _check_equal(
             env,
             number,
             "joint target",
@@ -143,9 +143,11 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
         controller.reset(step.ended)
 
 
-def _compare(env: RobotTask, step: int, what: str, names: Sequence[Any], theirs: np.ndarray, ours: np.ndarray) -> None:
+def _check_equal(
+    env: RobotTask, step: int, what: str, names: Sequence[Any], theirs: np.ndarray, ours: np.ndarray
+) -> None:
     """Raise ExportError for the first value (world, column) that differs."""
-    wrong = np.argwhere(~(np.abs(ours - theirs) <= TOLERANCE * np.maximum(1.0, np.abs(theirs))))  # NaN too
+    wrong = np.argwhere(~(np.abs(ours - theirs) <= CONTRACT_TOLERANCE * np.maximum(1.0, np.abs(theirs))))  # NaN too
     if not len(wrong):
         return
     world, column = wrong[0]

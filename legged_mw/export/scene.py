@@ -26,7 +26,7 @@ from legged_mw.utils.errors import ModelError
 
 AROUND = 1000.0  # width of the level ground around the steps [m]
 HOME = "home"  # keyframe with the start pose, and the servos holding it
-TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
+MODEL_TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
 _OPTION = (
     *("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance"),
     *("disableflags", "enableflags", "gravity", "impratio"),
@@ -209,7 +209,7 @@ def differences(trained: mujoco.MjModel, model: mujoco.MjModel) -> list[str]:
 
 def _close(a: object, b: object) -> bool:
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    return a.shape == b.shape and bool(np.all(np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(a))))
+    return a.shape == b.shape and bool(np.all(np.abs(a - b) <= MODEL_TOLERANCE * np.maximum(1.0, np.abs(a))))
 
 
 # ---- meshes that MuJoCo builds from some numbers, written as those numbers: as text, their vertices are most of an MJ
