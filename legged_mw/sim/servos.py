@@ -16,7 +16,7 @@ from legged_mw.utils.motor_network import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE
 
 # what ctrl means: an angle to turn to [rad], a speed [rad/s], or a torque [N m]
 Drive = Literal["angle", "speed", "torque"]
-# tables of motors with a torque-speed curve, before a "gear": [N m], [rad/s]
+# tables of a torque-speed curve at the motor, before its gear: [N m], [rad/s]
 CURVE = ("stall_torque", "no_load_speed")
 _INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
 

@@ -27,18 +27,8 @@ wp.config.log_level = wp.LOG_WARNING  # else it prints a line for each kernel mo
 
 _STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
 # Other fields that carry over from step to step.
-_CARRIED = (
-    "time",
-    "act",
-    "qacc_warmstart",
-    "qfrc_applied",
-    "eq_active",
-    "mocap_pos",
-    "mocap_quat",
-    "history",
-    "plastic",
-)
-_CARRIED += ("userdata",)
+_CARRIED = ("time", "act", "qacc_warmstart", "qfrc_applied", "eq_active")
+_CARRIED += ("mocap_pos", "mocap_quat", "history", "plastic", "userdata")
 # With 1 Newton and 5 line-search iterations both bits are always set: they say "not converged", as intended.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 # With more Newton iterations a conditional loop in the graph pays for its launch.
