@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class RobotError(UserError, RuntimeError):
-    """A robot does not answer, or its answer does not fit the contract. The text says what happened and what was done."""
+    """The robot is silent, or its answer does not fit the contract. The text says what happened and what was done."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Robot(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Switch the servos off, which leaves the joints damped, and close links. Safe to call twice, and after an error."""
+        """Switch the servos off, so joints are only damped, and close links. Safe to call twice, and after an error."""
 
     def damp(self) -> None:
         """For the next period: no stiffness, joints damped. By default it closes the robot, which ends the run."""
@@ -136,7 +136,7 @@ class Robot(ABC):
         return Health()
 
     def fell(self) -> bool:
-        """True if it fell by a rule of the contract that only the robot can check. The caller checks the tilt from ``read``."""
+        """True if it fell by a rule that only the robot can check. The caller checks the tilt from ``read``."""
         return False
 
     def __enter__(self) -> Any:

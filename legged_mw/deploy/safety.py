@@ -59,10 +59,9 @@ class Tripped(RobotError):
 class Limits:
     """Limits of D joints in the contract's order. The first five come from the machine; the others can be set by name.
 
-    A default without a source is ours. It is what the shipped policies of Go1, Go2 and G1 need in the walking exam with
-    its
-    pushes of 2 m/s (the figure in brackets), plus a margin. Tighter limits of one robot or policy belong in its
-    contract.
+    A default without a source is ours. It is what the shipped policies of Go1, Go2 and G1 need in the walking exam
+    with its pushes of 2 m/s (the figure in brackets), plus a margin. Tighter limits of one robot or policy belong in
+    its contract.
     """
 
     low: Floats  # (D,) [rad] range of the joints
