@@ -367,7 +367,7 @@ def read_motors(section: Reader, joints: int) -> Motors:
 
 
 def make_network(folder: Path, motors: Motors, count: int, joints: int) -> NetworkMotors | None:
-    """Network motors of ``count`` robots; None for another law. Raises ContractError, or UserError for a broken file."""
+    """Network motors of ``count`` robots; None for another law. Raises ContractError or UserError."""
     if motors.law != "network":
         return None
     if not (folder / MOTORS_FILE).is_file():
@@ -659,7 +659,7 @@ def part(folder: Path, name: str) -> Path:
 
 
 def edits(folder: Path) -> list[str]:
-    """A line for each number of the export in ``folder`` that differs from the exported one, and for each changed file."""
+    """A line for each changed number of the export in ``folder``, with the exported one, and for each changed file."""
     lines = changes(load_yaml(part(folder, CONTRACT_FILE)))
     files = _changed_files(folder, read_contract(folder, edited=True))
     return [f"{CONTRACT_FILE}: {line}" for line in lines] + [

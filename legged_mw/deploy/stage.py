@@ -81,7 +81,7 @@ class DeployStage:
         return np.concatenate([self.measured.lin_vel[:, :2], self.measured.ang_vel[:, 2:]], axis=1)
 
     def believed_velocity(self) -> Floats | None:
-        """(N, 2) vx, vy [m/s], estimated by leg odometry, or by the policy at its last step; None without an estimate."""
+        """(N, 2) vx, vy [m/s] from leg odometry, else from the policy at its last step; None without an estimate."""
         estimate = self._seen.lin_vel if self.odometry else self.controller.estimate("base_lin_vel")
         return None if estimate is None else estimate[:, :2]
 
@@ -106,7 +106,7 @@ class DeployStage:
         return ""
 
     def push(self, world: int, velocity: Any) -> None:
-        """Add ``velocity`` (2,) [m/s, world frame] to the robot's horizontal velocity. The policy sees it a step later."""
+        """Add ``velocity`` (2,) [m/s, world frame] to the base velocity. The policy sees it a step later."""
         self.fleet.qvel[world, :2] += velocity
 
     def put(self, qpos: Floats, qvel: Floats) -> None:
