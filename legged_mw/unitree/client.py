@@ -245,7 +245,7 @@ class UnitreeRobot(Robot):
 
 
 def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> None:
-    """Refuse a policy that needs other measurements than this robot's, or does not command angles. Raises RobotError."""
+    """Refuse a policy with rows that this robot does not measure, or without angle commands. Raises RobotError."""
     if contract.action.origin in ("torque", "speed"):
         raise RobotError(
             f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here"

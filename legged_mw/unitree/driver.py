@@ -1,4 +1,4 @@
-"""The entry points of ``legged_mw.deploy --robot unitree`` and ``--serve unitree``. Deploy finds them by the flag's value."""
+"""Entry points of ``legged_mw.deploy --robot unitree`` and ``--serve unitree``: deploy imports them by the flag's value."""
 
 from __future__ import annotations
 
