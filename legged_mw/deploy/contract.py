@@ -416,7 +416,12 @@ def _sigmoid(x: Floats) -> Floats:
     return 1 / (1 + np.exp(-np.clip(x, -80.0, 80.0)))
 
 
-FORMATS = (2, 3, 4, 5)  # from 5 on: range of targets, checksums of the scenes; older ones take the range from the scene
+FORMATS = (
+    2,
+    3,
+    4,
+    5,
+)  # 5 adds the range of targets and the scenes' checksums; older ones take the range from the scene
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.mjz"  # the same robot on steps and blocks; only of policies trained on such ground
 

@@ -297,8 +297,8 @@ class Controller:
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
         """Joint targets (N, D) [rad], or torques [N m], for the next period.
 
-        ``commands`` (N, C) in the contract's order. The targets are clipped to the servos' range; ``last_targets`` are
-        not.
+        ``commands`` (N, C) in the contract's order. The result is clipped to the servos' range; ``last_targets`` holds
+        the targets before that.
         """
         action = self.contract.action
         self._frames = self._look(measurement, commands)

@@ -1,7 +1,6 @@
 """The exams of an export, in MuJoCo's C engine. ``legged_mw.eval.rules`` has the walking exam, ``skill`` the others.
 
-A step has the same order as in the environment's exams, so both give one result: sample, decide, push, move, check
-falls.
+A step is in the order of the environment's exams, so both give one result: sample, decide, push, move, check falls.
 """
 
 # pyright: reportAttributeAccessIssue=false

@@ -2,8 +2,8 @@
 
 It finds a wrong joint and a wrong sign. It replaces ``States``: zero torque -> (start) -> joint check -> damping, under
 the same safety layer.
-Angles come from the motors' encoders. A motor plugged in or mounted wrongly together with its encoder measures the
-right angle. For legs, the tilt of a freely hanging body then shows the direction; else only a watching person can.
+Angles come from the motors' encoders. They look right if a motor is plugged in or mounted wrongly together with its
+encoder. For legs, the tilt of a freely hanging body then shows the direction; otherwise only a watching person can.
 """
 
 # pyright: reportAttributeAccessIssue=false

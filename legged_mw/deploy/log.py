@@ -1,9 +1,8 @@
 """The log of a run on one robot, in one compressed file: measurements, observations, actions, commands, trips.
 
 The file is a sequence of blocks. A block is its length (8 bytes, little-endian) and an .npz of that length: first a
-header with the export's files, then the columns of CHUNK steps at a time. A process that dies loses only the last
-chunk.
-The file holds no code and is read without pickle.
+header with the export's files, then the columns of CHUNK steps at a time.
+A process that dies loses only the last chunk. The file holds no code and is read without pickle.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class Measurement:
     acceleration: Floats  # (3,) of the IMU, body frame: (0, 0, 9.81) [m/s^2] when standing level
     foot_contact: Floats  # (F,) 1 for a foot on the ground, else 0
     # Row -> (size,): rows with sensors of their own, the height scan. For a motion also the root's attitude, and its
-    # position if a row needs it.
+    # position [m], if a row needs it.
     others: Mapping[str, Floats] = field(default_factory=dict)
 
     def of(self, robot: int) -> Measurement:

@@ -2,8 +2,8 @@
 
 MuJoCo's sensors give the measurements, by name. A physics step computes sensors before it moves the robot. After each
 period the sensors of position, velocity and contact are therefore computed again, in the new state.
-Torque and acceleration need forces, so they are one physics step old, as in training. In training contact was one step
-old, too.
+Torque and acceleration need forces, so they are one physics step old, as in training.
+In training, contact was one step old, too.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -46,7 +46,7 @@ from legged_mw.utils.machine import require_memory, usable_cores
 
 
 def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity: Floats, heading: float = 0.0) -> None:
-    """Put the robot into a pose over its place (x, y) in ``data``.
+    """Put the robot into a pose at its (x, y) in ``data``, on the ground.
 
     ``angles`` (D,) [rad] of ``joints``, ``gravity`` (3,) in the body frame, heading [rad].
     """
@@ -178,8 +178,8 @@ class Fleet:
     def set_gains(self, stiffness: Floats, damping: Floats) -> None:
         """Set the servo gains of every robot: (D,) [N m/rad] and (D,) [N m s/rad], in the contract's order.
 
-        Damping is clipped to half of inertia / timestep, which these physics steps can integrate; real drives run
-        faster.
+        Damping is clipped to half of inertia / timestep, the most that these physics steps can integrate.
+        Real drives run faster.
         Motors that are not servos keep the scene's gains; without stiffness they are off.
         """
         scene, dofs, motors = self.model.dof_damping[self._dofs].ravel(), self._dofs, self.contract.motors

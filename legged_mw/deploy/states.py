@@ -2,7 +2,7 @@
 
 zero torque -> (start) -> stand -> (A) -> policy -> (select, a fall, a trip) -> damping -> (start) -> zero torque.
 
-A person changes the state by a remote, a gamepad or keys; only damping also comes by itself.
+A person changes the state by a remote, a gamepad or keys; only damping can begin by itself.
 The caller passes times in: nothing waits here.
 """
 
@@ -53,9 +53,9 @@ def _in_turns(values: Floats) -> Floats:
 def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
     """What is wrong with the IMU's axes, from one measurement a period; "" if nothing, or if too little moved.
 
-    Gravity must turn as the gyro says, and at rest point against the accelerometer. Two faults pass both checks: all
-    sensors of the IMU turned in the same way, or swapped in the same way about an axis without tilt. ``at_odds`` finds
-    those.
+    Gravity must turn as the gyro says, and at rest point against the accelerometer. Two faults pass both
+    checks: all sensors of the IMU are turned in the same way, or all swap the same axes and nothing tilts along the
+    third. ``at_odds`` finds those.
     """
     if len(seen) <= TURN:
         return ""
@@ -73,10 +73,11 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
 
 
 def at_odds(legs: Floats, gravity: Floats) -> str:
-    """Compare measured ``gravity`` (N, 3), one a period, with the estimate of the ``legs`` (N, 3); "" if they agree.
+    """Compare measured ``gravity`` (N, 3), one a period, with the estimate of the ``legs`` (N, 3).
 
-    Also "" if too little is known. A slope shifts the two by a constant, so pitch and roll must change alike, and the
-    shift must not exceed the steepest slope.
+    Returns the difference in words; "" if they agree, or if too little is known.
+    A slope shifts the two by a constant. Pitch and roll must therefore change alike, and the shift must not exceed the
+    steepest slope.
     """
     known = np.isfinite(legs).all(axis=1)
     if known.sum() < TURN:

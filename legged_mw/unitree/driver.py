@@ -1,4 +1,7 @@
-"""Entry points of ``legged_mw.deploy --robot unitree`` and ``--serve unitree``: deploy imports them by the flag's value."""
+"""Entry points of ``legged_mw.deploy --robot unitree`` and ``--serve unitree``.
+
+Deploy imports this module by the flag's value.
+"""
 
 from __future__ import annotations
 

@@ -66,8 +66,7 @@ class Posted(NamedTuple):
 class Board:
     """Shared memory: the guard writes, the policy's process reads the newest content.
 
-    Content counts only with the right checksum, so the order in which another processor sees the writes does not
-    matter.
+    Content counts only with the right checksum: another processor may see the writes in any order.
     """
 
     def __init__(self, file: int, size: int) -> None:
@@ -111,8 +110,9 @@ class Guarded:
         process: subprocess.Popen[bytes] | None = None,
         clock: Callable[[], float] = clock,
     ) -> None:
-        """Connect to the guard at the other end of ``channel``. ``commander`` sends if the guard fails (``link.Commander``).
+        """Connect to the guard at the other end of ``channel``.
 
+        ``commander`` (``link.Commander``) sends if the guard fails.
         Raises RobotError with the guard's error if it cannot take the robot over.
         """
         self._channel, self._board, self._commander, self.process, self._clock = (

@@ -48,7 +48,10 @@ def default_domain(interface: str) -> int:
 
 
 def join(interface: str, domain: int) -> Any:
-    """A participant of the domain. Raises RobotError if the interface is missing, or if joining could harm its robots."""
+    """A participant of the domain.
+
+    Raises RobotError if the interface is missing, or if joining could harm the robots on it.
+    """
     names = [name for _, name in socket.if_nameindex()]
     if interface not in names:
         raise RobotError(f"--interface: {unknown('network interface', interface, names, 'this machine')}")
