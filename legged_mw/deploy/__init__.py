@@ -1,1 +1,4 @@
-"""An exported policy on another physics, or on a robot. Needs numpy, mujoco, onnxruntime and pyyaml; neither torch nor warp."""
+"""Run an exported policy in another simulator or on a robot.
+
+Needs numpy, mujoco, onnxruntime and pyyaml; neither torch nor warp.
+"""

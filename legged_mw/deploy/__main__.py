@@ -32,7 +32,7 @@ _OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "fault", "watchdo
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --robot, --serve and what goes with them."""
+    """Add --robot, --serve and their flags."""
     parser.add_argument("--robot", choices=ROBOTS, default="simulated", help="unitree: a Go2 or G1 at --interface")
     parser.add_argument(
         "--serve", choices=ROBOTS[1:], help="simulate such a robot at --interface, for --robot to drive"
@@ -59,7 +59,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse what does not go together. Raises UserError."""
+    """Refuse flags that do not go together. Raises UserError."""
     wire = args.robot == "unitree" or args.serve
     for name in _OF_A_ROBOT:
         if not wire and getattr(args, name) is not None:
@@ -93,17 +93,17 @@ def check_flags(args: argparse.Namespace) -> None:
 
 
 def driver(name: str) -> Any:
-    """The module that speaks with robots of that kind; its package is imported only here."""
+    """The module for this kind of robot. Only here is its package imported."""
     return import_module(f"legged_mw.{name}.driver")
 
 
 def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
-    """A simulated robot on the wire."""
+    """Serve a simulated robot on the wire."""
     print(driver(args.serve).serve(folder, contract, args, lift(args)))
 
 
 def contact_source(args: argparse.Namespace, contract: Contract) -> str | None:
-    """How leg odometry finds feet on the ground; None without odometry. Raises RobotError."""
+    """The source of foot contact for leg odometry; None without odometry. Raises RobotError."""
     if args.velocity != ODOMETRY:
         return None
     feels = args.robot == "simulated" or driver(args.robot).senses_feet(contract)
@@ -115,7 +115,7 @@ def contact_source(args: argparse.Namespace, contract: Contract) -> str | None:
 
 
 def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> Robot:
-    """The robot on the wire."""
+    """Connect to the robot on the wire."""
     return driver(args.robot).connect(folder, contract, args, odometry=args.velocity == ODOMETRY)
 
 
@@ -226,7 +226,7 @@ def main() -> None:
 
 
 def find(name: str) -> Path:
-    """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
+    """The folder of an export, or of the shipped policy of this name. Raises UserError if there is neither."""
     if (folder := typed(name)).exists():
         return check_folder(folder)
     if not (SHIPPED / name).is_dir():
@@ -236,12 +236,12 @@ def find(name: str) -> Path:
 
 
 def results(folder: Path) -> Path:
-    """Where what is made of an export goes: beside it; of a shipped one, which is the package's, into logs as play.py's does."""
+    """The folder for results of an export: beside it. Results of a shipped policy go to logs, as in play.py."""
     return Path("logs", folder.name, "shipped") if folder.resolve().parent == SHIPPED.resolve() else folder
 
 
 def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
-    """A log beside its simulation: the table, and a picture beside the log."""
+    """Compare a log with its simulation: print the table and write a plot beside the log."""
     replayed = replay.replay(path, folder, edited)
     print(replay.table(replayed))
     replay.draw(replayed, path.with_suffix(".png"))
@@ -249,7 +249,7 @@ def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
 
 
 def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None, edited: bool = False) -> None:
-    """The exam: its table, and a JSON file at ``path``. ``contact`` and ``edited``: see DeployStage."""
+    """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage."""
     contract = read_contract(folder, edited)
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:

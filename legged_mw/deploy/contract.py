@@ -1,6 +1,6 @@
-"""The contract of an exported policy: what ``policy.yaml`` states, checked against the network and the scene beside it.
+"""The contract of an exported policy: ``policy.yaml``, checked against the network and the scene beside it.
 
-The export writes it from here and ``legged_mw.deploy`` reads it with this. Nothing is stepped and no network is run.
+The export writes it from here, and ``legged_mw.deploy`` reads it. This module steps no physics and runs no network.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -36,22 +36,22 @@ from legged_mw.utils.motor_network import (
 # ---- typed values of a contract -------------------------------------------------------------------------------------
 
 
-MOST = 1e6  # no quantity of a robot is larger, in any unit
-MOST_VALUES = 10_000_000  # of an observation: a camera's picture has a tenth
+MOST = 1e6  # upper bound of any quantity of a robot, in any unit
+MOST_VALUES = 10_000_000  # upper bound of an observation's values; a camera picture has a tenth
 
 
 class ContractError(UserError, ValueError):
-    """An export that cannot be deployed; the text names the file, what it states, what was expected and what to do."""
+    """An export that cannot be deployed. The text names the file, the value, the expected value and what to do."""
 
 
 class Reader:
-    """Takes typed values out of a mapping; a missing or ill-typed one is one clear line."""
+    """Takes typed values out of a mapping. A missing or ill-typed value raises one clear line."""
 
     def __init__(self, values: Mapping[str, Any], where: str) -> None:
         self.values, self.where = values, where
 
     def take(self, key: str, wanted: str, fits: Callable[[Any], bool]) -> Any:
-        """The value of ``key`` if it fits; ``wanted`` are the words for what does."""
+        """The value of ``key`` if it fits. ``wanted`` describes a value that fits."""
         if key not in self.values or not fits(self.values[key]):
             found = f"is {brief(self.values[key])}" if key in self.values else "is missing"
             raise ContractError(f"{self.where}: '{key}' {found}; it must be {wanted}")
@@ -93,12 +93,12 @@ class Reader:
         return np.array(value, dtype=float)
 
     def file(self, key: str, name: str) -> None:
-        """An export's files have fixed names and lie beside the contract, whoever wrote it."""
+        """Check a file name: an export's files have fixed names and lie beside the contract."""
         if key in self.values:
             self.take(key, f"{name}, which lies beside {self.where.partition(':')[0]}", lambda v: v == name)
 
     def scale(self, count: int, of: str) -> np.ndarray:
-        """``scale`` as one number a value; one for all may stand for them."""
+        """``scale``, one number a value. The file may give one number for all."""
         wanted = f"a number, or {count} numbers, one a {of}"
         value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
         self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
@@ -106,8 +106,8 @@ class Reader:
 
 
 def compile_scene(file: Path) -> Any:
-    """The model in an export's scene. Raises ContractError."""
-    from legged_mw.robot.mjcf import XmlSource, check_model  # which bring MuJoCo
+    """Compile the scene of an export. Raises ContractError."""
+    from legged_mw.robot.mjcf import XmlSource, check_model  # imports MuJoCo
 
     try:
         model = XmlSource(file, alone=True).spec().compile()
@@ -118,7 +118,7 @@ def compile_scene(file: Path) -> Any:
 
 
 def is_number(value: object) -> bool:
-    # a whole number may be no float
+    # an int may be too large for a float
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
@@ -130,24 +130,26 @@ def is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> 
 
 
 ORIGINS = ("default", "joints", "targets", "torque", "speed")
-_LARGEST = 1000.0  # [L] clips at 100
-_BEYOND = 1e-3  # [rad] that a pose may be beyond its range by rounding
+_LARGEST = 1000.0  # legged_gym clips at 100
+_BEYOND = 1e-3  # [rad] that rounding may put a pose beyond its range
 
 
 class Action(NamedTuple):
-    """What an action means: joint target = origin + scale * action [rad], or torque [N m] or speed [rad/s] = scale * action.
+    """Meaning of an action: joint target = origin + scale * action [rad].
 
-    The policy's own target is what limits judge, and what the origin "targets" goes on from; a servo gets it `held`.
+    Or torque [N m] = scale * action, or speed [rad/s] = scale * action.
+    Limits check the target before it is clipped, and the origin "targets" adds to it. The servo gets the clipped one.
     """
 
-    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": none
+    # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": none
+    origin: str
     scale: np.ndarray  # (D,) [rad], [N m] or [rad/s]
-    clip: float  # |action| at most [-]
-    lowest: np.ndarray  # (D,) what a servo is told at least, as in training; MOST either way: anything
-    highest: np.ndarray  # (D,) and at most
+    clip: float  # [-] largest |action|
+    lowest: np.ndarray  # (D,) lowest target of the servo, as in training; -MOST: no limit
+    highest: np.ndarray  # (D,) highest target; MOST: no limit
 
     def held(self, targets: np.ndarray) -> np.ndarray:
-        """``targets`` (..., D) within the range; NaN stays."""
+        """Clip ``targets`` (..., D) to the range; NaN stays."""
         return np.clip(targets, self.lowest, self.highest)
 
     def to_dict(self) -> dict[str, Any]:
@@ -158,12 +160,12 @@ class Action(NamedTuple):
 
 
 def short(values: Sequence[float]) -> float | list[float]:
-    """One number where all are the same."""
+    """One number if all are equal, else the list."""
     return values[0] if len(set(values)) == 1 else list(values)
 
 
 def read_action(action: Reader, joints: Sequence[str], scene: Path | None) -> Action:
-    """From the contract's reader of the section; ``scene``: where a contract is too old to state the range."""
+    """Read the section ``action``. ``scene`` gives the range if the contract is too old to state it."""
     origin, count = action.take("origin", f"one of {', '.join(ORIGINS)}", lambda v: v in ORIGINS), len(joints)
     scale = action.scale(count, "joint")
     action.take("scale", "other than 0, which moves nothing", lambda _: bool(scale.any()))
@@ -176,7 +178,7 @@ def read_action(action: Reader, joints: Sequence[str], scene: Path | None) -> Ac
 
 
 def target_range(model: mujoco.MjModel, actuators: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest target (D,) that these motors obey; MOST either way where they obey any."""
+    """Lowest and highest target (D,) of these motors; -MOST and MOST without a limit."""
     held, ranges = model.actuator_ctrllimited[list(actuators), None] > 0, model.actuator_ctrlrange[list(actuators)]
     lowest, highest = np.where(held, ranges, [-MOST, MOST]).T
     return lowest, highest
@@ -196,7 +198,7 @@ def _range_of_scene(scene: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.
 
 
 def check_pose(action: Action, joints: Sequence[str], pose: np.ndarray) -> None:
-    """Raises ContractError where ``pose`` (D,) [rad] is beyond the range."""
+    """Raise ContractError if ``pose`` (D,) [rad] is beyond the range."""
     for joint in np.flatnonzero((pose < action.lowest - _BEYOND) | (pose > action.highest + _BEYOND)).tolist():
         raise ContractError(
             f"policy.yaml: default_pose of {joints[joint]} is {pose[joint]:g} rad, beyond the range of its targets, "
@@ -207,11 +209,11 @@ def check_pose(action: Action, joints: Sequence[str], pose: np.ndarray) -> None:
 # ---- what the policy estimates --------------------------------------------------------------------------------------
 
 
-ESTIMATE = "estimate"  # the output's name, and the contract's section that lists its rows
+ESTIMATE = "estimate"  # name of the network's output, and of the contract's section with its rows
 
 
 class Estimated(NamedTuple):
-    """One row of the output."""
+    """One row of the estimate."""
 
     name: str
     size: int
@@ -220,7 +222,7 @@ class Estimated(NamedTuple):
 
 
 def read_estimated(rows: Sequence[Any]) -> tuple[Estimated, ...]:
-    """The rows from the contract's readers of ``estimate``."""
+    """Read the rows of the section ``estimate``."""
     return tuple(
         Estimated(row.text("name"), row.count("size"), row.text("unit", empty=True), row.text("frame", empty=True))
         for row in rows
@@ -228,7 +230,7 @@ def read_estimated(rows: Sequence[Any]) -> tuple[Estimated, ...]:
 
 
 def columns_of(rows: Sequence[Estimated], name: str) -> slice | None:
-    """Columns of the row ``name`` in the output; None if it is not estimated."""
+    """Columns of the row ``name`` in the estimate; None without such a row."""
     start = 0
     for row in rows:
         if row.name == name:
@@ -240,18 +242,18 @@ def columns_of(rows: Sequence[Estimated], name: str) -> slice | None:
 # ---- the memory of a recurrent network ------------------------------------------------------------------------------
 
 
-MEMORY = "memory"  # the contract's section, inside of `network`
+MEMORY = "memory"  # subsection of `network` in the contract
 
 
 class NetworkMemory(NamedTuple):
-    """An input and an output of the network, (batch, *shape) each: what goes out goes in at the next step, at first zeros."""
+    """Memory of a recurrent network: an output, (batch, *shape), that is an input of the next step; zeros at first."""
 
     input: str
     output: str
-    shape: tuple[int, ...]  # layers, values each; of an LSTM the layers' h, then their c
+    shape: tuple[int, ...]  # layers, values each; for an LSTM h of all layers, then c of all layers
 
     def start(self, count: int) -> NDArray[np.float32]:
-        """Of ``count`` robots that remember nothing."""
+        """The memory of ``count`` robots at their start: zeros."""
         return np.zeros((count, *self.shape), dtype=np.float32)
 
     def to_dict(self) -> dict[str, Any]:
@@ -259,7 +261,7 @@ class NetworkMemory(NamedTuple):
 
 
 def read_memory(section: Reader) -> NetworkMemory:
-    """From the contract's reader of the section."""
+    """Read the section ``memory``."""
     wanted = "two whole numbers from 1: states and the size of each"
     shape = section.take(
         "shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
@@ -271,18 +273,18 @@ def read_memory(section: Reader) -> NetworkMemory:
 # ---- the motion that a policy follows -------------------------------------------------------------------------------
 
 
-MOTION, MOTION_FILE = "motion", "motion.npz"  # the contract's section; the file, as legged_mw.skills.clip has it
+MOTION, MOTION_FILE = "motion", "motion.npz"  # the contract's section; its file, in the format of legged_mw.skills.clip
 JOINT_POS, JOINT_VEL, PLACE, TURN = "reference_joint_pos", "reference_joint_vel", "anchor_pos", "anchor_ori"
-REFERENCE = (JOINT_POS, JOINT_VEL, PLACE, TURN)  # what the controller makes of it
-# in Measurement.others: of the root, (4,) w x y z, and (3,) [m], world frame
+REFERENCE = (JOINT_POS, JOINT_VEL, PLACE, TURN)  # rows that the controller computes from the motion
+# in Measurement.others: attitude (4,) w x y z and position (3,) [m] of the root, world frame
 ATTITUDE, POSITION = "attitude", "position"
 
 
 class FollowedMotion(NamedTuple):
-    """What is followed: at the anchor, and with which bodies."""
+    """The motion that the policy follows: its anchor body and the tracked bodies."""
 
     anchor: str
-    bodies: tuple[str, ...]  # that were compared in training
+    bodies: tuple[str, ...]  # compared with the motion in training
     digest: str  # SHA-256 of MOTION_FILE
 
     def to_dict(self) -> dict[str, Any]:
@@ -290,7 +292,7 @@ class FollowedMotion(NamedTuple):
 
 
 def read_motion(section: Reader) -> FollowedMotion:
-    """From the contract's reader of the section."""
+    """Read the section ``motion``."""
     bodies = section.texts("bodies")
     section.file("file", MOTION_FILE)
     return FollowedMotion(
@@ -312,15 +314,15 @@ _ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {
 
 
 class Motors(NamedTuple):
-    """What turns a joint target into a torque; a real robot's motors are their own law."""
+    """The law from joint target to torque in simulation. A real robot has its own motors."""
 
     law: str = "servo"
     stall_torque: tuple[float, ...] = ()  # (D,) [N m] at the joint; empty: no torque-speed curve
-    no_load_speed: tuple[float, ...] = ()  # (D,) [rad/s] likewise
+    no_load_speed: tuple[float, ...] = ()  # (D,) [rad/s] at the joint; empty: no torque-speed curve
     digest: str = ""  # SHA-256 of the network's file
 
     def to_dict(self) -> dict[str, Any]:
-        """The section; nothing for servos."""
+        """The section ``motors``; empty for servos."""
         curve = (
             {"stall_torque": list(self.stall_torque), "no_load_speed": list(self.no_load_speed)}
             if self.stall_torque
@@ -330,7 +332,7 @@ class Motors(NamedTuple):
         return {MOTORS: {"law": self.law, **curve, **network}} if self.law != "servo" else {}
 
     def gains(self, model: mujoco.MjModel, actuators: list[int], dofs: np.ndarray) -> dict[str, np.ndarray]:
-        """What ``model`` has of gains and curve, one a joint each, by the contract's names."""
+        """Gains and torque-speed curve of ``model``, (D,) each, by the contract's names."""
         prm = model.actuator_gainprm[actuators]
         found = {}
         if self.law == "servo":
@@ -343,7 +345,7 @@ class Motors(NamedTuple):
         return found
 
     def limp(self, batch: Any) -> None:
-        """Switch the motors of ``batch``, which are no servos, off: what is left is damping, if there is any."""
+        """Switch off the motors of ``batch`` (not servos). Only damping is left, if they have any."""
         if self.law == "dc_motor":
             batch.expand("actuator_gainprm")[:, :, DC_STIFFNESS] = 0.0
         else:
@@ -354,7 +356,7 @@ SERVOS = Motors()
 
 
 def read_motors(section: Reader, joints: int) -> Motors:
-    """The motors from the contract's reader of the section ``motors``."""
+    """Read the section ``motors``."""
     law = section.take("law", f"one of {', '.join(LAWS)}", lambda value: value in LAWS)
     section.file("file", MOTORS_FILE)
     names = ("stall_torque", "no_load_speed") if law == "dc_motor" or "stall_torque" in section.values else ()
@@ -365,7 +367,7 @@ def read_motors(section: Reader, joints: int) -> Motors:
 
 
 def make_network(folder: Path, motors: Motors, count: int, joints: int) -> NetworkMotors | None:
-    """The motors of ``count`` robots, where they are a network. Raises ContractError, or UserError for a broken one."""
+    """Network motors of ``count`` robots; None for another law. Raises ContractError or UserError."""
     if motors.law != "network":
         return None
     if not (folder / MOTORS_FILE).is_file():
@@ -378,17 +380,17 @@ def make_network(folder: Path, motors: Motors, count: int, joints: int) -> Netwo
 
 
 class NetworkMotors:
-    """The motors of N robots with D joints: ``torque`` is called once a simulation step."""
+    """Motors of N robots with D joints, modelled by a network. Call ``torque`` once a simulation step."""
 
     def __init__(self, network: MotorNetwork, robots: int, joints: int) -> None:
         self.network = network
-        # newest first; errors, speeds, scaled
+        # scaled errors and speeds, newest first
         self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)
         # h and c of each layer
         self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]
 
     def reset(self, which: Any = slice(None)) -> None:
-        """The robots ``which`` (indices or a mask) begin again: nothing was ever off its target."""
+        """Start the robots ``which`` (indices or a mask) again, with zero errors and speeds in the past."""
         for memory in (self._past, *self._memory):
             memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
 
@@ -414,20 +416,25 @@ def _sigmoid(x: Floats) -> Floats:
     return 1 / (1 + np.exp(-np.clip(x, -80.0, 80.0)))
 
 
-FORMATS = (2, 3, 4, 5)  # 5: the range of targets, and checksums of the scenes; older ones take the range from the scene
+FORMATS = (
+    2,
+    3,
+    4,
+    5,
+)  # 5 adds the range of targets and the scenes' checksums; older ones take the range from the scene
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
-TERRAIN_FILE = "terrain.mjz"  # the same robot among steps and blocks; only of policies that were trained on such ground
+TERRAIN_FILE = "terrain.mjz"  # the same robot on steps and blocks; only of policies trained on such ground
 
 
 class Quantity(NamedTuple):
-    """Where the value of an observation row comes from."""
+    """The source of an observation row."""
 
     measured: str  # a field of robot.Measurement, or one of COMPUTED
     unit: str
     frame: str
 
 
-# Observation rows that a task may use as they are. A row of another name names its sensors: Row(..., sensors=, unit=).
+# Observation rows that a task may use by name. Any other row names its sensors: Row(..., sensors=, unit=).
 ROWS: dict[str, Quantity] = {
     "base_lin_vel": Quantity("lin_vel", "m/s", "body, at the IMU"),
     "base_ang_vel": Quantity("ang_vel", "rad/s", "body"),
@@ -451,16 +458,16 @@ ROWS: dict[str, Quantity] = {
         "the robot stands on level ground, within 1 m; x by x from behind, in each from right to left",
     ),
 }
-# by the controller; a robot measures all others
+# computed by the controller; a robot measures all others
 COMPUTED = ("joint_offset", "last_action", "command", "gait_clock", *REFERENCE)
-# What the sensors of a scene measure; "up" is the world's z axis in the IMU's frame, opposite to gravity.
+# Quantities of the scene's sensors. "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque")
-FALL = "fall_contact"  # contacts of `ends: falls_on` with the ground; only where there are such geoms
+FALL = "fall_contact"  # ground contacts of the geoms in `ends: falls_on`; only with such geoms
 SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the scene
 SCAN = "height_scan"  # ContractRow.measured of the height scan
 CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
-OWN = (SENSORS, SCAN, "")  # rows that come whole, in Measurement.others, by their names
-_FARTHEST = 100.0  # [rad] or [m] of a joint's default, either way
+OWN = (SENSORS, SCAN, "")  # rows that Measurement.others holds whole, by name
+_FARTHEST = 100.0  # [rad] or [m] largest default of a joint, either sign
 
 
 @dataclass(frozen=True)
@@ -471,48 +478,48 @@ class ContractRow:
     size: int
     unit: str
     frame: str
-    noise: float  # half width of the uniform noise that it was trained with, in `unit`
+    noise: float  # half width of the uniform noise in training, in `unit`
     measured: str  # a field of robot.Measurement, one of COMPUTED, "sensors", or "" if the task does not state it
     sensors: tuple[str, ...] = ()
     scale: tuple[float, ...] = (1.0,)  # one a value, or one for all: the network sees scale * value
-    history: int = 1  # after a reset all frames are the first one
+    history: int = 1  # frames; after a reset all are equal to the first
 
 
 class Ends(NamedTuple):
-    """What counts as a fall and ends a walk; nothing does where none of it is set."""
+    """The falls that end a walk; unset rules end nothing."""
 
     max_tilt: float | None = None  # [deg] between the robot's z axis and the vertical
-    # [m] of the root above the ground; a real robot cannot judge it, a simulated one does
+    # [m] of the root above the ground; checked in simulation, not on a real robot
     min_base_height: float | None = None
-    falls_on: tuple[str, ...] = ()  # geoms that must not touch the ground; judged in simulation, too
-    not_covered: tuple[str, ...] = ()  # methods of the task that ended its episodes, too; nobody judges those here
+    falls_on: tuple[str, ...] = ()  # geoms that must not touch the ground; checked in simulation only
+    not_covered: tuple[str, ...] = ()  # the task's own methods that ended episodes in training; not checked here
 
     def tilted(self, gravity: np.ndarray) -> np.ndarray:
-        """Whether ``gravity`` (..., 3), its direction in the body frame, means a fall; NaN does."""
+        """True if ``gravity`` (..., 3), its direction in the body frame, means a fall; also for NaN."""
         if self.max_tilt is None:
             return np.zeros(gravity.shape[:-1], dtype=bool)
         return ~(gravity[..., 2] <= -math.cos(math.radians(self.max_tilt)))
 
 
 class HeightScan(NamedTuple):
-    """Where a height scan looks: at each x, at each y [m] from the root, ahead and to the left."""
+    """The grid of a height scan: each x times each y [m] from the root, ahead and to the left."""
 
     x: tuple[float, ...]
     y: tuple[float, ...]
-    standing: float  # [m] of the root above level ground, where the scan is zero
+    standing: float  # [m] height of the root above level ground at which the scan is zero
 
 
 class Gait(NamedTuple):
-    """A clock that begins at 0 when the robot is told to move, and rests at 0 while it is told to stand."""
+    """A gait clock. It starts at 0 with a command to move and rests at 0 with a command to stand."""
 
     period: float  # [s]
-    offsets: tuple[float, ...]  # (F,) of each foot's phase, share of the period
+    offsets: tuple[float, ...]  # (F,) phase of each foot, share of the period
     min_command: float  # norm of (vx, vy, yaw rate) up to which a command means stand
 
 
 @dataclass(frozen=True)
 class Contract:
-    """What a robot and a policy agree on; D joints, F feet, C commands. What is per joint is in the order of ``joints``."""
+    """The agreement of a robot and a policy; D joints, F feet, C commands. Joints are in the order of ``joints``."""
 
     task: str
     joints: tuple[str, ...]
@@ -521,40 +528,40 @@ class Contract:
     stiffness: np.ndarray  # (D,) [N m/rad] of the position servos
     damping: np.ndarray  # (D,) [N m s/rad]
     period: float  # [s] between two actions
-    timestep: float  # [s] of the physics that it was trained in
+    timestep: float  # [s] of the physics in training
     decimation: int  # physics steps a period
-    commands: tuple[Command, ...]  # as trained; none of a task without commands
+    commands: tuple[Command, ...]  # as trained; empty for a task without commands
     rows: tuple[ContractRow, ...]
     sensors: dict[str, tuple[str, ...]]  # quantity -> sensors of the scene
-    feet: dict[str, tuple[str, ...]]  # foot -> its contact sensors: it touches the ground where one of them does
+    feet: dict[str, tuple[str, ...]]  # foot -> its contact sensors: the foot is on the ground if one of them is
     ends: Ends
     imu: str
     mass: float  # [kg] of the whole robot
-    input: str  # of the network: (batch, size of all rows)
-    output: str  # (batch, D)
+    input: str  # input of the network: (batch, size of all rows)
+    output: str  # output of the network: (batch, D)
     digest: str  # SHA-256 of the network's file
-    scan: HeightScan | None = None  # where a row asks for one
-    gait: Gait | None = None  # likewise
+    scan: HeightScan | None = None  # if a row needs it
+    gait: Gait | None = None  # if a row needs it
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
-    safety: Mapping[str, Any] | None = None  # limits by name, other than the defaults of safety.Limits
+    safety: Mapping[str, Any] | None = None  # limits by name that replace the defaults of safety.Limits
     memory: NetworkMemory | None = None  # of a recurrent network
     estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
-    motion: FollowedMotion | None = None  # that the policy follows
-    scene: str = ""  # SHA-256 of the scene's file; none in a format before 5
-    terrain: str = ""  # that of the scene among steps, if there is one
+    motion: FollowedMotion | None = None  # of a policy that follows one
+    scene: str = ""  # SHA-256 of the scene's file; empty in formats before 5
+    terrain: str = ""  # SHA-256 of the scene with steps, if there is one
 
     @property
     def size(self) -> int:
-        """Values of an observation."""
+        """Number of values in an observation."""
         return sum(row.size * row.history for row in self.rows)
 
     def held(self, command: Sequence[float] | np.ndarray) -> np.ndarray:
-        """``command`` (C,) held within the trained ranges."""
+        """Clip ``command`` (C,) to the trained ranges."""
         return np.clip(command, [c.low for c in self.commands], [c.high for c in self.commands])
 
     def to_dict(self) -> dict[str, Any]:
-        """What policy.yaml holds."""
+        """The content of policy.yaml."""
         ends = {
             name: list(value) if isinstance(value, tuple) else value
             for name, value in self.ends._asdict().items()
@@ -611,9 +618,9 @@ def _row_to_dict(row: ContractRow) -> dict[str, Any]:
 
 
 def read_contract(folder: Path, edited: bool = False) -> Contract:
-    """The contract in ``folder``: complete, typed, of the network that lies beside it, and of the scenes, if there are any.
+    """Read the contract in ``folder`` and check it against the network and the scenes beside it.
 
-    ``edited``: it may have been changed in what the network was trained with; see ``edits``.
+    ``edited``: accept changed values that the network was trained with; see ``edits``.
     Raises ContractError (or ConfigError, if the YAML is broken) with one line.
     """
     finish_moving(folder)
@@ -648,7 +655,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
 
 
 def part(folder: Path, name: str) -> Path:
-    """A file of the export in ``folder``. Raises ContractError if it is not there."""
+    """Path of a file of the export in ``folder``. Raises ContractError if it is missing."""
     if not (folder / name).is_file():
         raise ContractError(
             f"no {name} in {folder}; make an export with: python play.py --task <task> --export {folder}"
@@ -657,7 +664,7 @@ def part(folder: Path, name: str) -> Path:
 
 
 def edits(folder: Path) -> list[str]:
-    """A line for each number of the export in ``folder`` that was changed since, beside the exported one, and for each other file."""
+    """A line for each changed number of the export in ``folder``, with the exported one, and for each changed file."""
     lines = changes(load_yaml(part(folder, CONTRACT_FILE)))
     files = _changed_files(folder, read_contract(folder, edited=True))
     return [f"{CONTRACT_FILE}: {line}" for line in lines] + [
@@ -725,7 +732,7 @@ def _read(top: Reader, folder: Path) -> Contract:
 
 
 def _read_scenes(physics: Reader, version: int) -> dict[str, Any]:
-    """Their checksums."""
+    """Checksums of the scenes."""
     physics.file("file", SCENE_FILE)
     if version < 5:
         return {}
@@ -759,7 +766,7 @@ def _read_row(row: Reader) -> ContractRow:
 
 
 def _read_ends(ends: Reader) -> Ends:
-    """A misspelt rule would silently end nothing, so it is an error."""
+    """Read the section ``ends``. A misspelt rule would end nothing, so it is an error."""
     for name in ends.values:
         if name not in Ends._fields:
             raise ContractError(f"{ends.where}: {unknown('rule', name, Ends._fields, 'the rules that end a walk')}")
@@ -774,7 +781,7 @@ def _read_ends(ends: Reader) -> Ends:
 
 
 def _read_scan(top: Reader) -> HeightScan | None:
-    """Where the height scan looks, if a row is one."""
+    """The grid of the height scan, if a row is one."""
     if not any(row.values.get("measured") == SCAN for row in top.sections("observation")):
         return None
     scan = top.section(SCAN)
@@ -783,7 +790,7 @@ def _read_scan(top: Reader) -> HeightScan | None:
 
 
 def _read_gait(top: Reader) -> Gait | None:
-    """The clock, if a row is one."""
+    """The gait clock, if a row is one."""
     if not any(row.values.get("measured") == CLOCK for row in top.sections("observation")):
         return None
     gait, names = top.section("gait"), [command.values.get("name") for command in top.sections("commands", empty=True)]
@@ -800,7 +807,7 @@ def _read_gait(top: Reader) -> Gait | None:
 
 
 def quantity_size(contract: Contract, name: str) -> int:
-    """Values of a measured or computed quantity."""
+    """Number of values of a measured or computed quantity."""
     per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action", JOINT_POS, JOINT_VEL)
     scan = len(contract.scan.x) * len(contract.scan.y) if contract.scan else 0
     counts = {
@@ -813,7 +820,7 @@ def quantity_size(contract: Contract, name: str) -> int:
 
 
 def _check_rows(contract: Contract) -> None:
-    """Every row is one that can be measured, of the right size, and what ends a walk by falling on it is felt."""
+    """Check that every row can be measured and has the right size, and that `falls_on` geoms have contact sensors."""
     felt = [name.removeprefix("contact/") for name in contract.sensors.get(FALL, ())]
     for name in contract.ends.falls_on if felt else ():
         if name not in felt:

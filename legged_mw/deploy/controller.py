@@ -1,4 +1,4 @@
-"""The network of an export and the controller around it: measurement and command in, servo targets out. No robot, no clock."""
+"""The controller of an exported policy: measurement and command in, servo targets out. No robot, no clock."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -49,7 +49,7 @@ Doubles = NDArray[np.float64]
 
 
 class GaitPhase:
-    """Clocks of ``count`` robots with F feet; it moves on by the contract's period with each ``keep``."""
+    """Gait clocks of ``count`` robots with F feet. Each ``keep`` advances them by the contract's period."""
 
     def __init__(self, contract: Contract, count: int) -> None:
         """``contract`` has a section ``gait``."""
@@ -57,22 +57,22 @@ class GaitPhase:
         self._gait, self._share = contract.gait, contract.period / contract.gait.period
         names = [command.name for command in contract.commands]
         self._velocity = [names.index(name) for name in VELOCITY]
-        self.phase: Floats = np.zeros(count)  # share of the period, of the last step
-        self.running: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # likewise: told to move
-        self.start: Floats = np.zeros(count)  # where a robot's clock is at its first step, if that is told to move
+        self.phase: Floats = np.zeros(count)  # (N,) share of the gait period, in the last step
+        self.running: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # (N,) likewise: true if the command was to move
+        self.start: Floats = np.zeros(count)  # (N,) phase at a robot's first step, if it is commanded to move
 
     def row(self, commands: Floats, fresh: NDArray[np.bool_]) -> Floats:
-        """Sine of each foot's phase, then cosine (N, 2F); zeros at rest. ``fresh`` (N,) are robots at their first step."""
+        """Sine of each foot's phase, then cosine (N, 2F); zeros at rest. ``fresh`` (N,): robots at their first step."""
         phase, running = self._next(commands, fresh)
         angle = 2.0 * math.pi * (phase[:, None] + np.array(self._gait.offsets))
         return np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * running[:, None]
 
     def keep(self, commands: Floats, fresh: NDArray[np.bool_]) -> None:
-        """A step with these ``commands`` (N, C) was made."""
+        """Advance by one step with these ``commands`` (N, C)."""
         self.phase, self.running = self._next(commands, fresh)
 
     def _next(self, commands: Floats, fresh: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
-        """Phase and whether it runs (N,), in the step to come."""
+        """Phase (N,) in the coming step, and whether the clock runs (N,)."""
         velocity = np.atleast_2d(commands)[:, self._velocity]
         running = np.broadcast_to((velocity**2).sum(axis=1) > self._gait.min_command**2, self.running.shape)
         phase = np.where(fresh, self.start, np.where(self.running, (self.phase + self._share) % 1.0, 0.0))
@@ -83,13 +83,13 @@ class GaitPhase:
 
 
 class Follower:
-    """The phase of ``count`` robots: the frame that each is to reach in the step to come. After the last frame it is held.
+    """The motion phase of ``count`` robots: the frame to reach in the coming step. The last frame is held.
 
-    A real robot does not know where in the world it is: as it begins, the motion is moved and turned to where the robot stands.
+    A real robot does not know its place in the world. At its first step the motion is moved and turned to the robot.
     """
 
     def __init__(self, folder: Path, contract: Contract, count: int) -> None:
-        """The file that ``contract.motion`` names. Raises ContractError for another one."""
+        """Load the file that ``contract.motion`` names. Raises ContractError for another file."""
         assert contract.motion
         file = folder / MOTION_FILE
         if not file.is_file() or digest(file) != contract.motion.digest:
@@ -100,17 +100,17 @@ class Follower:
         self._model = compile_scene(part(folder, SCENE_FILE))
         self._data, self._anchor = mujoco.MjData(self._model), self._model.body(contract.motion.anchor).id
         self._angles = [int(self._model.joint(name).qposadr[0]) for name in contract.joints]
-        # the last frame is held at rest
+        # the last frame is held, with joint speeds of zero
         speed = np.concatenate([self.clip.qvel()[:, 6:], np.zeros((1, len(contract.joints)))])
         self._joints = np.concatenate([self.clip.joint_pos, self.clip.joint_pos[-1:]]), speed
         place, turn = self._anchors(self.clip.root_pos, self.clip.root_quat, self.clip.joint_pos)
         self._place, self._turn = np.concatenate([place, place[-1:]]), np.concatenate([turn, turn[-1:]])
         self.frame = np.ones(count, dtype=int)
-        self.start: NDArray[np.int64] | None = None  # frames to be at instead, in the world's own frame: as in training
+        self.start: NDArray[np.int64] | None = None  # (N,) these frames instead, in the world frame, as in training
         self._shift, self._heading = np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
 
     def rows(self, measured: Measurement, fresh: NDArray[np.bool_]) -> dict[str, Doubles]:
-        """What the policy sees (N, ...); ``fresh`` (N,) are robots at their first step."""
+        """Observation rows of the motion, (N, ...) each. ``fresh`` (N,): robots at their first step."""
         place, turn = self._measured(measured)
         shift, turned = self._moved(place, turn, fresh)
         frame = self._now()
@@ -120,16 +120,16 @@ class Follower:
         return rows | {PLACE: _rotate(conjugate(turn), there - place), TURN: off[:, :, :2].reshape(len(off), 6)}
 
     def keep(self, measured: Measurement, fresh: NDArray[np.bool_]) -> None:
-        """A step was made."""
+        """Advance by one step."""
         self._shift, self._heading = self._moved(*self._measured(measured), fresh)
         self.frame = np.minimum(self._now() + 1, len(self._place) - 1)
 
     def reset(self, which: Any) -> None:
-        """The robots ``which`` are at the first frame."""
+        """Put the robots ``which`` back to the first frame."""
         self.frame[which] = 1
 
     def ghost(self) -> Doubles:
-        """The frames that come next, where the motion was moved to: (N, nq) of the scene."""
+        """The coming frames (N, nq) of the scene, moved and turned as the motion is."""
         frame = np.minimum(self._now(), len(self.clip.root_pos) - 1)
         states = np.zeros((len(frame), self._model.nq))
         states[:, :3] = _rotate(self._heading, self.clip.root_pos[frame]) + self._shift
@@ -143,7 +143,7 @@ class Follower:
         return np.minimum(self.frame if self.start is None else self.start, len(self._place) - 1)
 
     def _measured(self, measured: Measurement) -> tuple[Doubles, Doubles]:
-        """Place (N, 3) and attitude (N, 4) of the anchor; from the root's and the joints' measured angles."""
+        """Place (N, 3) and attitude (N, 4) of the anchor, from the measured root and joint angles."""
         attitude = np.atleast_2d(measured.others[ATTITUDE])
         root = np.atleast_2d(measured.others.get(POSITION, np.zeros((len(attitude), 3))))
         return self._anchors(root, attitude, np.atleast_2d(measured.joint_pos))
@@ -157,7 +157,7 @@ class Follower:
         return place, turn
 
     def _moved(self, place: Doubles, turn: Doubles, fresh: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
-        """How the motion is moved (N, 3) and turned (N, 4); where ``fresh``, to the robot's own place and heading."""
+        """Shift (N, 3) and turn (N, 4) of the motion; for ``fresh`` robots to their own place and heading."""
         if self.start is not None:
             return self._shift, self._heading
         before = self._now() - 1
@@ -167,35 +167,36 @@ class Follower:
 
 
 def _rotate(q: Doubles, v: Doubles) -> Doubles:
-    """Vectors (N, 3) turned by ``q`` (N, 4)."""
+    """Rotate vectors (N, 3) by quaternions (N, 4)."""
     return (_matrix(q) @ v[..., None])[..., 0]
 
 
 def _matrix(q: Doubles) -> Doubles:
-    """(N, 3, 3) of quaternions (N, 4)."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4)."""
     matrices = np.zeros((len(q), 9))
     for matrix, each in zip(matrices, q, strict=True):
         mujoco.mju_quat2Mat(matrix, each)
     return matrices.reshape(-1, 3, 3)
 
 
-_FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # of the first call: networks of robots take a thousandth of either
+_FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # of the first call; robot networks need a thousandth of either
 
 
 class Network:
-    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32. ``estimate`` (N, E) is of the last call.
+    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32.
 
-    A recurrent one also takes what it remembers, and returns it after the actions: (N, *shape) of ``contract.memory``.
+    A recurrent network also takes its memory, (N, *shape) of ``contract.memory``, and returns it after the actions.
+    ``estimate`` (N, E) belongs to the last call.
     """
 
     def __init__(self, folder: Path, contract: Contract) -> None:
-        """Load it; raises ContractError if its inputs and outputs are not the contract's."""
+        """Load the network. Raises ContractError if its inputs or outputs differ from the contract's."""
         try:
             import onnxruntime
         except ImportError:
             raise UserError("running an exported policy needs onnxruntime: pip install onnxruntime") from None
         options, self._run = onnxruntime.SessionOptions(), onnxruntime.RunOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a network this small loses by a second
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a second thread slows a network this small
         options.log_severity_level = self._run.log_severity_level = 4
         network = (folder / NETWORK_FILE).read_bytes()
         self._session = self._first(
@@ -211,14 +212,14 @@ class Network:
         self._try()
 
     def _first(self, work: Callable[[], Any], what: str) -> Any:
-        """The first time that the file decides what happens here. Raises ContractError for what takes no end or no measure."""
+        """Load or run the file for the first time. Raises ContractError if it takes too much time or memory."""
         try:
             return contained(work, _FIRST_SECONDS, _FIRST_ROOM, stop=lambda: setattr(self._run, "terminate", True))
         except TimeoutError:
             raise ContractError(
                 f"{NETWORK_FILE} cannot be {what}: its first call takes longer than {_FIRST_SECONDS:g} s"
             ) from None
-        except Exception as error:  # onnxruntime raises a type of its own for each way that a file is broken
+        except Exception as error:  # onnxruntime has one exception type per kind of damage
             if isinstance(error, MemoryError) or "alloc" in str(error):
                 raise ContractError(
                     f"{NETWORK_FILE} cannot be {what}: it asks for more than {_FIRST_ROOM >> 30} GiB"
@@ -227,7 +228,7 @@ class Network:
             raise ContractError(f"{NETWORK_FILE} {text}: it is damaged; export the policy again") from None
 
     def _try(self) -> None:
-        """One call with zeros."""
+        """Call the network once with zeros."""
         zeros = {name: np.zeros((1, *shape), dtype=np.float32) for name, shape in self._inputs.items()}
         found = self._first(lambda: self._session.run([*self._outputs], zeros, self._run), "run")
         for (name, shape), value in zip(self._outputs.items(), found, strict=True):
@@ -238,7 +239,7 @@ class Network:
                 )
 
     def _check(self, contract: Contract) -> bool:
-        """Inputs and outputs of the contract's names and sizes; returns whether the batch is fixed to 1."""
+        """Compare inputs and outputs with the contract. Returns True if the batch is fixed to 1."""
         names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
         guessed = "".join(f", {row.name} {row.size}" for row in contract.estimate)
         for what, ports, shapes, why in (
@@ -271,31 +272,33 @@ class Network:
 
 
 class Controller:
-    """A policy at work on ``count`` robots: observations and joint targets as the contract states them, and the memory they need."""
+    """Runs a policy on ``count`` robots: observations and joint targets as the contract states, with their memory."""
 
     def __init__(
         self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None
     ) -> None:
-        """``network``: what stands for the one in ``folder``; see ``Network``."""
+        """``network`` replaces the one in ``folder``; see ``Network``."""
         self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
         self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
-        self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad] the policy's own
-        # as last observed
+        # (N, D) [rad] before they are clipped to the servos' range
+        self.last_targets = np.tile(contract.default_pose, (count, 1))
+        # frames of the last observation, a row each
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]
-        self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
+        self._fresh = np.ones(count, dtype=bool)  # (N,) robots without an observation since their reset
         self.clock = GaitPhase(contract, count) if contract.gait else None
         self.follower = Follower(folder, contract, count) if contract.motion else None
         self.memory = contract.memory.start(count) if contract.memory else None  # (N, *shape)
 
     def observe(self, measurement: Measurement, commands: Floats) -> NDArray[np.float32]:
-        """The network's input (N, size) from a measurement of N robots (or of one, without the leading axis)."""
+        """The network's input (N, size) from the measurement of N robots. One robot needs no leading axis."""
         return _side_by_side(self._look(measurement, commands))
 
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
-        """Joint targets (N, D) [rad], or torques [N m], for the next period; ``commands`` (N, C) in the contract's order.
+        """Joint targets (N, D) [rad], or torques [N m], for the next period.
 
-        They are within the range that servos obey; what the policy asked for itself is in ``last_targets``.
+        ``commands`` (N, C) in the contract's order. The result is clipped to the servos' range; ``last_targets`` holds
+        the targets before that.
         """
         action = self.contract.action
         self._frames = self._look(measurement, commands)
@@ -309,7 +312,7 @@ class Controller:
             actions = self._network(seen)
         else:
             actions, self.memory = self._network(seen, self.memory)
-        actions = np.where(np.isfinite(actions), actions, np.nan)  # a clipped infinity would look like a wish
+        actions = np.where(np.isfinite(actions), actions, np.nan)  # a clipped infinity would pass for a valid action
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {
             "default": self.contract.default_pose,
@@ -320,12 +323,12 @@ class Controller:
         return action.held(self.last_targets)
 
     def estimate(self, row: str) -> NDArray[np.float64] | None:
-        """What the policy believed of ``row`` when it acted last (N, size), in the contract's unit; None if it does not estimate that."""
+        """The policy's last estimate of ``row`` (N, size), in the contract's unit; None without an estimate of it."""
         columns, believed = columns_of(self.contract.estimate, row), getattr(self._network, "estimate", None)
         return None if columns is None or believed is None else believed[:, columns].astype(np.float64)
 
     def reset(self, which: Any = slice(None)) -> None:
-        """The robots ``which`` (indices or a mask) begin again: nothing of theirs is remembered."""
+        """Start the robots ``which`` (indices or a mask) again, without any memory."""
         self.last_actions[which], self.last_targets[which], self._fresh[which] = 0.0, self.contract.default_pose, True
         if self.memory is not None:
             self.memory[which] = 0.0
@@ -362,9 +365,10 @@ def _side_by_side(frames: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable[[], None] = lambda: None) -> Any:
-    """What ``work`` returns, or raises, within that time and ``room`` [byte] of new memory; for a call that a stranger's file decides.
+    """Return, or raise, the result of ``work`` within ``seconds`` and ``room`` [byte] of new memory.
 
-    Past its time it is asked to ``stop``, and a TimeoutError raised; if it does not, it is left behind. Memory is limited on Linux.
+    For calls into a foreign file. After ``seconds`` it calls ``stop`` and raises TimeoutError; a thread that does not
+    stop is abandoned. Memory is limited on Linux only.
     """
     ended: Future[Any] = Future()
 
@@ -388,7 +392,7 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Meanwhile the process may take ``size`` [byte] more than it has."""
+    """Within this context the process may take ``size`` [byte] of new memory."""
     if not Path("/proc/self/statm").exists():
         yield
         return

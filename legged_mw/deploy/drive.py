@@ -1,4 +1,4 @@
-"""A person drives one robot from a terminal: states, safety, log and loop put together. Prints happen on a thread of their own."""
+"""A person drives one robot from a terminal: states, safety, log and loop together. A separate thread prints."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from legged_mw.view.script import load_script
 CHECK_KEYS = "keys: s start, x damping, Esc emergency stop"
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
 GAMEPADS = Path("/dev/input")  # where Linux has them
-LIFT = 0.3  # [m] ours: higher than a robot stands hangs one whose feet must not touch the ground
+LIFT = 0.3  # [m] ours: hangs the robot so high that its feet cannot touch the ground
 STATUS = 0.2  # [s] between two status lines
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of driving a robot, and of its log."""
+    """Add the flags of driving and logging."""
     parser.add_argument(
         "--drive",
         action="store_true",
@@ -92,12 +92,12 @@ def check_flags(args: argparse.Namespace) -> None:
 
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
-    """Whether a simulated robot begins on a hoist."""
+    """True if a simulated robot begins on a hoist."""
     return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or args.check_joints))
 
 
 def lift(args: argparse.Namespace) -> float:
-    """How far above its start it hangs [m]."""
+    """Height [m] of the hoisted robot above its start."""
     return LIFT * (args.hoist == "high" or (args.hoist is None and args.check_joints))
 
 
@@ -110,9 +110,10 @@ def drive(
     kind: str,
     contact: str | None = None,
 ) -> None:
-    """Drive ``robot`` until Ctrl-C or for ``args.time``, or check its joints; one that is wrong ends the program with code 1.
+    """Drive ``robot`` until Ctrl-C or for ``args.time``, or check its joints. A failed joint check exits with code 1.
 
-    ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log. ``contact``: of Odometry, if any.
+    ``fixed`` (C,) is the command while no source drives; None: the defaults. ``kind``: of robot, for the log.
+    ``contact``: of Odometry, if any.
     """
     with ExitStack() as stack:
         stack.callback(robot.close)
@@ -129,7 +130,8 @@ def drive(
         stack.enter_context(_ended_by_signals())
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None
-        log = Log(path, contract, folder, kind, console.say) if path else None  # last: what is refused leaves none
+        # last, so that a refused run leaves no log
+        log = Log(path, contract, folder, kind, console.say) if path else None
 
         def show(now: float, measured: Measurement | None) -> None:
             console.show(now, states)
@@ -146,7 +148,7 @@ def drive(
 
 
 def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[InputSource]:
-    """Who may drive; the first one that does goes before the others."""
+    """Input sources in the order of priority: the first one that drives wins."""
     sources: list[InputSource] = [RobotRemote(contract.commands)]
     if args.stop_fd is not None:
         sources.append(StopFile(args.stop_fd))
@@ -159,7 +161,7 @@ def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], 
 
 
 def _gamepad(contract: Contract, asked: str | None) -> Gamepad | None:
-    """The one that is asked for, else the first that can be opened. Raises RobotError."""
+    """The gamepad at path ``asked``; None: the first that opens, if any. Raises RobotError."""
     if asked:
         return None if asked == "off" else Gamepad(Path(asked), contract.commands)
     for path in sorted(GAMEPADS.glob("js*")):
@@ -171,7 +173,7 @@ def _gamepad(contract: Contract, asked: str | None) -> Gamepad | None:
 def _commands(
     contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, say: Callable[[str], None]
 ) -> Callable[[float], Floats]:
-    """The command (C,) at a time since the policy began: of the script, the fixed one, or the defaults."""
+    """The command (C,) at a time [s] since the policy began: from the script, else fixed, else the defaults."""
     rest = np.array([each.default for each in contract.commands]) if fixed is None else np.array(fixed)
     if not args.commands:
         return lambda _: rest
@@ -186,7 +188,7 @@ def _commands(
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """A request to end, or a closed terminal, damps the robot as Ctrl-C does."""
+    """SIGTERM and a closed terminal damp the robot as Ctrl-C does."""
     asked = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(each, signal.default_int_handler) for each in asked]
     try:
@@ -197,7 +199,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 class DriveConsole:
-    """Prints lines and, in a terminal, a status below them, on a thread: a terminal that hangs delays no step."""
+    """Prints lines on a thread, with a status below them in a terminal. A terminal that hangs delays no step."""
 
     def __init__(self, contract: Contract) -> None:
         self._units = with_units(contract.commands)
@@ -214,18 +216,18 @@ class DriveConsole:
         self._thread.join(timeout=1.0)
 
     def say(self, line: str) -> None:
-        """A line that stays."""
+        """Print a line that stays."""
         self._lines.put((line, False))
 
     def show(self, now: float, states: States) -> None:
-        """Overwrite one line with the state and its command."""
+        """Overwrite the status line: state and command."""
         if self._terminal and now >= self._next and self._lines.qsize() < 10:
             self._next = now + STATUS
             command = " ".join(f"{value:+.2f}" for value in states.command)
             self._lines.put((f"{now:7.1f} s  {states.state:<11}  command {command} ({self._units})", True))
 
     def _print(self) -> None:
-        with suppress(OSError, ValueError):  # nobody reads any more: the run goes on, and ends by its own rules
+        with suppress(OSError, ValueError):  # the terminal is gone: the run goes on and ends by its own rules
             while (entry := self._lines.get()) is not None:
                 line, fleeting = entry
                 clear = "\r\x1b[K" if self._terminal else ""

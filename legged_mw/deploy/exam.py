@@ -1,6 +1,6 @@
-"""The exams on an export, in MuJoCo's C engine. What the walking exam asks is in ``legged_mw.eval.rules``, of others in ``skill``.
+"""The exams of an export, in MuJoCo's C engine. ``legged_mw.eval.rules`` has the walking exam, ``skill`` the others.
 
-The order of a step is that of the environment's exams, so that both give one result: sample, decide, push, move, look for falls.
+A step is in the order of the environment's exams, so both give one result: sample, decide, push, move, check falls.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -41,17 +41,17 @@ def run_exam(
     contact: str | None = None,
     edited: bool = False,
 ) -> dict[str, Any]:
-    """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError.
+    """Grade the export in ``folder`` by the rules ``exam``, else by its contract. Raises ContractError, ConfigError.
 
-    ``common``: the contract's, but in the one range that all published policies of the robot were asked. ``contact`` and
-    ``edited``: see DeployStage.
+    ``common``: the contract's rules, but with the command range shared by all published policies of the robot.
+    ``contact`` and ``edited``: see DeployStage.
     """
     contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
     wanted = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
-    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # what counts as a fall in legged_mw.eval.exam
+    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.exam
     stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact, edited=edited)
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
@@ -60,9 +60,9 @@ def run_exam(
         sampled["position"].append(stage.qpos()[:, :2])
         sampled["power"].append(np.abs(stage.measured.joint_torque * stage.measured.joint_vel).sum(axis=1))
         sampled["joint_speed"].append(np.abs(stage.measured.joint_vel).mean(axis=1))
-        _push(stage, exam, step)  # the policy decides on what was measured before
+        _push(stage, exam, step)  # the policy decides on a measurement before the push
         stage.step(wanted)
-        estimate = stage.believed_velocity()  # from that measurement
+        estimate = stage.believed_velocity()  # from the same measurement
         sampled["estimate"] += [] if estimate is None else [estimate]
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     signals = {name: np.stack(values) for name, values in sampled.items() if values}
@@ -72,7 +72,7 @@ def run_exam(
 
 
 def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False) -> dict[str, Any]:
-    """Grade the export in ``folder`` by ``skill``, else by what its contract names. ``edited``: see DeployStage."""
+    """Grade the export in ``folder`` by ``skill``, else by the skill in its contract. ``edited``: see DeployStage."""
     skill = skill or contract_skill(read_contract(folder, edited))
     return skill.result(
         {name: skill.judge(*perform(folder, skill, ground, threads, edited)) for name, ground in skill.grounds.items()}
@@ -80,7 +80,7 @@ def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0, edited
 
 
 def contract_skill(contract: Contract) -> Skill:
-    """The exam that the section ``exam`` of a contract names by its key ``kind``."""
+    """The skill exam named by the key ``kind`` in the contract's section ``exam``."""
     section = dict(contract.exam or {})
     try:
         return make_skill(str(section.pop("kind", "")), section)
@@ -91,7 +91,7 @@ def contract_skill(contract: Contract) -> Skill:
 def perform(
     folder: Path, skill: Skill, ground: ExamGround, threads: int = 0, edited: bool = False
 ) -> tuple[ExamRobot, Recording]:
-    """Put robots into their starts on ``ground`` and let the policy act."""
+    """Put robots into their starts on ``ground`` and run the policy."""
     stage = DeployStage(
         folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited
     )
@@ -114,7 +114,7 @@ def perform(
 
 
 def put_on(model: mujoco.MjModel, ground: ExamGround) -> None:
-    """Change a scene: the lean of gravity, the friction of the ground, the mass of the root and its inertia in proportion."""
+    """Edit a scene: slope (by leaning gravity), friction of the ground, mass of the root (inertia in proportion)."""
     if ground.slope:
         size, angle = np.linalg.norm(model.opt.gravity), math.radians(ground.slope)
         model.opt.gravity[:] = size * math.sin(angle), 0.0, -size * math.cos(angle)
@@ -128,7 +128,7 @@ def put_on(model: mujoco.MjModel, ground: ExamGround) -> None:
 
 
 def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
-    """The rules for an export: the section ``exam`` of its contract, if it has one, the trained ranges, and how many feet it has."""
+    """The walking exam of an export: its contract's section ``exam``, the trained ranges and the number of feet."""
     trained = {command.name: (command.low, command.high) for command in contract.commands}
     if missing := [name for name in VELOCITY if name not in trained]:
         raise ContractError(
@@ -147,7 +147,7 @@ def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
 
 
 def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
-    """At its step, direction k of every speed: the base's horizontal velocity jumps, world frame."""
+    """At step k of the pushes, add each push speed in direction k to the base's horizontal velocity, world frame."""
     k = step - round(rules.PUSH_AT / stage.dt)
     if 0 <= k < rules.PUSH_DIRECTIONS:
         angle = 2 * math.pi * k / rules.PUSH_DIRECTIONS
@@ -159,30 +159,31 @@ def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
 # ---- two policies on one robot: the first until it falls, the second until it stands --------------------------------
 
 
-# [deg] between the robot's z axis and the vertical: the second policy takes over [ours: a walker does not come back]
+# [deg] tilt of the robot's z axis at which the second policy takes over [ours: a walker does not recover from it]
 FELL = 60.0
-# It stands again, so that the first takes over, while it is [ours]:
-UP, NEAR, SLOW = 10.0, 0.3, 1.0  # [deg] tilted; [rad] from the first's default pose; [rad/s] of joints; means over them
-HOLD = 0.5  # [s] for so long
+# The robot stands again, and the first policy takes over, when all three hold [ours]:
+# [deg] tilt; [rad] mean distance of joints from the first's default pose; [rad/s] mean joint speed
+UP, NEAR, SLOW = 10.0, 0.3, 1.0
+HOLD = 0.5  # [s] that they must hold
 
 
 class SwitchStage(DeployStage):
-    """Robots that follow the policy in ``first``; one that falls follows that in ``second`` until it stands.
+    """Robots with the policy in ``first``. After a fall the policy in ``second`` runs until the robot stands.
 
-    None is put back, but those that MuJoCo cannot step.
+    Only robots that MuJoCo cannot step are reset.
     """
 
     def __init__(
         self, first: Path, second: Path, num_worlds: int = 1, command: Any = None, edited: bool = False
     ) -> None:
         """``edited``: see read_contract. Raises UserError for policies of two robots, ContractError for broken ones."""
-        # its body touches the ground
+        # the body touches the ground
         super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True, edited=edited)
         other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
-        self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) robots that follow the second policy
-        self._standing = np.zeros(num_worlds, dtype=int)  # (N,) periods that it has stood
+        self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) True while the second policy runs
+        self._standing = np.zeros(num_worlds, dtype=int)  # (N,) periods that the robot has stood
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
 
     def step(self, commands: Floats | None = None) -> None:
@@ -194,19 +195,19 @@ class SwitchStage(DeployStage):
         self.fleet.write(np.where(rescued, targets[1], targets[0]))
         self.measured = self.fleet.read()
         broken = self.fleet.broken | ~np.isfinite(self.fleet.qvel).all(axis=1)
-        for world in np.flatnonzero(broken):  # nothing is left of it that could stand up
+        for world in np.flatnonzero(broken):  # such a state cannot stand up
             self.reset(int(world))
         tilted = self.contract.ends.tilted(self.measured.gravity)
         self._fell, stood = tilted & ~self.rescued, self._stood(self.measured)
         back = self.rescued & stood
         self.rescued = (self.rescued | self._fell) & ~back
-        # it begins anew when it takes over, and remembers nothing until then
+        # the policy that does not run keeps no memory, so it starts fresh
         self.controller.reset(self.rescued | back)
         self.rescuer.reset(~self.rescued | self._fell)
         self._fell |= broken
 
     def _stood(self, measured: Measurement) -> np.ndarray:
-        """(N,) Upright, near the first policy's default pose and slow, for HOLD."""
+        """(N,) True if upright, near the first policy's default pose and slow, for HOLD."""
         upright = ~Ends(max_tilt=UP).tilted(measured.gravity)
         near = np.abs(measured.joint_pos - self.contract.default_pose).mean(axis=1) < NEAR
         slow = np.abs(measured.joint_vel).mean(axis=1) < SLOW
@@ -214,14 +215,14 @@ class SwitchStage(DeployStage):
         return self._standing >= round(HOLD / self.dt)
 
     def reset(self, world: int) -> None:
-        """Back to the start, with the first policy."""
+        """Put the robot back to the start, with the first policy."""
         super().reset(world)
         self.rescuer.reset([world])
         self.rescued[world], self._standing[world] = False, 0
 
 
 def check_same(first: Contract, second: Contract) -> None:
-    """Raises UserError where two policies cannot drive one robot in turns."""
+    """Raise UserError if two policies cannot take turns on one robot."""
     own = sorted({row.name for row in second.rows if row.measured in OWN} - {row.name for row in first.rows})
     for what, here, there in (
         ("joints", first.joints, second.joints),

@@ -1,6 +1,7 @@
-"""Who drives a robot: its own remote, a gamepad, the keys of a terminal, a file descriptor that stops it. No robot moves here.
+"""Input sources: the robot's remote, a gamepad, the keys of a terminal, a file descriptor that stops the robot.
 
-Each is asked once a step and must not block: it hands out what was pressed since, the command of its sticks, and a reason to stop.
+The loop polls each source once a step. A source must not block. It returns the buttons pressed since the last poll, the
+command of its sticks, and a reason to stop. Nothing here moves a robot.
 """
 
 from __future__ import annotations
@@ -23,35 +24,38 @@ from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.view.drive import ACTIONS, BINDINGS, Pilot
 
 START, WALK, END = "start", "A", "select"  # buttons of the states, as in unitree_rl_gym
-STOP = frozenset({"L2", "B"})  # held together: the emergency stop [unitree_rl_lab]
-DEAD = 0.08  # [-] of a stick near its centre that counts as the centre
+STOP = frozenset({"L2", "B"})  # held together: emergency stop [unitree_rl_lab]
+DEAD = 0.08  # [-] deadband of a stick around its centre
 _STICKS = dict(zip(VELOCITY, (("ly", 1.0), ("lx", -1.0), ("rx", -1.0)), strict=True))  # command -> stick, sign
 
 
 class DriveInput(NamedTuple):
-    """What is wanted in this step."""
+    """The input of one step."""
 
     pressed: frozenset[str] = frozenset()  # of START, WALK, END, since the last step
     command: Floats | None = None  # (C,); None: this source does not drive now
-    stop: str = ""  # why the robot must be damped at once
+    stop: str = ""  # reason to damp the robot at once
 
 
 class InputSource(Protocol):
-    """One who may drive."""
+    """An input source: it may drive."""
 
     def poll(self, health: Health) -> DriveInput:
-        """Since the last call."""
+        """The input since the last call."""
         ...
 
     def let_go(self) -> None:
-        """Another source drives now: forget what was commanded."""
+        """Another source drives now: clear this source's command."""
 
     def close(self) -> None:
-        """Free what is held; again is allowed."""
+        """Free keys and files. Safe to call twice."""
 
 
 def from_sticks(remote: Remote, table: Sequence[Command]) -> Floats | None:
-    """(C,) of the sticks: their ends are the ends of the trained ranges, their centre is the default; None where all are centred."""
+    """Command (C,) of the sticks; None if all are centred.
+
+    A stick's ends are the ends of the trained range, its centre is the default.
+    """
     wanted, moved = np.array([each.default for each in table]), False
     for column, each in enumerate(table):
         stick, sign = _STICKS.get(each.name, ("", 0.0))
@@ -64,7 +68,7 @@ def from_sticks(remote: Remote, table: Sequence[Command]) -> Floats | None:
 
 
 class RobotRemote:
-    """The robot's own remote, as its health tells it."""
+    """The robot's own remote, as `health` reports it."""
 
     name = "the remote"
 
@@ -85,7 +89,7 @@ class RobotRemote:
 
 
 class Gamepad(RobotRemote):
-    """A gamepad at Linux's joystick interface, e.g. /dev/input/js0, with the buttons of an Xbox pad."""
+    """A gamepad with an Xbox layout, at Linux's joystick interface, e.g. /dev/input/js0."""
 
     name = "the gamepad"
     _EVENT = struct.Struct("<IhBB")  # time [ms], value, kind, number [linux/joystick.h]
@@ -94,7 +98,7 @@ class Gamepad(RobotRemote):
     _TRIGGERS = {2: "L2", 5: "R2"}  # -1 at rest
 
     def __init__(self, path: Path, table: Sequence[Command]) -> None:
-        """Raises RobotError if it cannot be opened."""
+        """Open the gamepad. Raises RobotError if that fails."""
         super().__init__(table)
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -135,7 +139,7 @@ class Gamepad(RobotRemote):
         return self._EVENT.unpack(data)[1:]
 
     def _take(self, value: int, kind: int, number: int) -> None:
-        kind &= 0x7F  # the highest bit marks the state at the opening
+        kind &= 0x7F  # the highest bit marks the state at opening
         if kind == 2 and number in self._AXES:
             stick, sign = self._AXES[number]
             self._sticks[stick] = sign * value / 32767
@@ -149,14 +153,15 @@ class Gamepad(RobotRemote):
 
 
 class Keys:
-    """The keys of a terminal, or lines of a pipe. Arrows, q, e, u, j, space and o drive as in the viewers."""
+    """Keys of a terminal, or lines of a pipe. Arrows, q, e, u, j, space and o drive as in the viewers."""
 
     STATES = {"s": START, "a": WALK, "x": END}
     _ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[D": "left", "\x1b[C": "right"}
-    _DRIVE = {key for b in BINDINGS[: ACTIONS.index("own") + 1] for key in b.keys}  # the others are of a simulation
+    # the other keys are for a simulation
+    _DRIVE = {key for b in BINDINGS[: ACTIONS.index("own") + 1] for key in b.keys}
 
     def __init__(self, table: Sequence[Command], file: int | None = None) -> None:
-        """``file``: its descriptor (None: standard input); a terminal gives its keys at once until ``close``."""
+        """Read from descriptor ``file`` (None: standard input). A terminal sends single keys until ``close``."""
         self._file = sys.stdin.fileno() if file is None else file
         self._pilot, self._closed = Pilot(table), False
         self._before = termios.tcgetattr(self._file) if os.isatty(self._file) else None
@@ -189,7 +194,7 @@ class Keys:
         self._before = None
 
     def _read(self) -> list[str]:
-        """Keys pressed since the last call, by name."""
+        """Names of the keys pressed since the last call."""
         text = ""
         while not self._closed and select.select([self._file], [], [], 0)[0]:
             try:
@@ -207,10 +212,10 @@ class Keys:
 
 
 class StopFile:
-    """Stops the robot as soon as a file descriptor can be read, or its other end is closed: for a switch, or a program that watches."""
+    """Stops the robot when a file descriptor is readable or its other end closes: for a switch or a watchdog."""
 
     def __init__(self, file: int) -> None:
-        """Raises RobotError if it is not open."""
+        """Raises RobotError if the descriptor is not open."""
         try:
             os.fstat(file)
         except OSError as error:

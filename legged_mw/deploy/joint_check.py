@@ -1,8 +1,9 @@
-"""The joint check: each joint in turn goes 0.1 rad and back, softly, while the others are held; which one moved, and which way?
+"""The joint check: each joint in turn goes 0.1 rad and back, softly, while the others are held.
 
-It is a set of states in place of ``States``: zero torque -> (start) -> joint check -> damping, watched by the same safety layer.
-Angles are the motors' own. A motor that is plugged in or turned wrongly together with its encoder looks right to them: then the
-tilt of a body that hangs freely tells, for legs, which way they moved; else only the person who watches.
+It finds a wrong joint and a wrong sign. It replaces ``States``: zero torque -> (start) -> joint check -> damping, under
+the same safety layer.
+Angles come from the motors' encoders. They look right if a motor is plugged in or mounted wrongly together with its
+encoder. For legs, the tilt of a freely hanging body then shows the direction; otherwise only a watching person can.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -22,30 +23,30 @@ from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHECK, DAMPING, SOFT, ZERO, Order, States
 
-STEP = 0.1  # [rad] that a joint is asked to move
-SETTLE, RAMP, REST = 2.0, 0.8, 0.6  # [s] ours: until all joints are held; from a pose to the next; after each joint
-SOFTLY, HOLD = 0.4, 1.2  # [s] ours, there: before it gets stiffer; before it is judged
-# [share of the stiffness a second] while nothing moves far enough: friction and weight, which a tenth may not overcome
+STEP = 0.1  # [rad] motion of a joint
+SETTLE, RAMP, REST = 2.0, 0.8, 0.6  # [s] ours: until all joints are held; ramp between two poses; rest after each joint
+SOFTLY, HOLD = 0.4, 1.2  # [s] ours, at the step: before the joint gets stiffer; before the verdict
+# [share of the stiffness per second] until the joint moves enough; SOFT may not overcome friction and weight
 STIFFEN = 1.5
-CLOSE, MOVED, FAR = 0.07, 0.03, 0.3  # [rad] ours: moved far enough; moved at all; so far that the check ends
-LEAN, ALONG = 2e-3, 0.3  # [rad] ours: of tilt that tells; cosine from which a tilt is as the joint tilts the body
-HEAVY = 0.4  # [share of the mass] ours: on one side of a joint from which the tilt does not tell: of a waist
+CLOSE, MOVED, FAR = 0.07, 0.03, 0.3  # [rad] ours: moved enough; moved at all; so far that the check ends
+LEAN, ALONG = 2e-3, 0.3  # [rad] ours: smallest useful tilt; cosine at which a tilt agrees with the joint
+HEAVY = 0.4  # [share of the mass] ours: with more on the joint's far side, as for a waist, the tilt tells nothing
 
 Moves = Generator[Order, Measurement, None]
 
 
 class JointResult(NamedTuple):
-    """What one joint did."""
+    """The result of one joint."""
 
     joint: int
-    asked: float  # [rad]
-    moved: Floats  # (D,) [rad]
-    stiffness: float  # share of the contract's that it took
-    verdict: str  # "right", or what is wrong
+    asked: float  # [rad] commanded step
+    moved: Floats  # (D,) [rad] motion of all joints
+    stiffness: float  # share of the contract's stiffness that the motion needed
+    verdict: str  # "right", or the fault
 
 
 class JointCheck(States):
-    """The check of one robot; ``rows`` and ``report`` tell what came of it."""
+    """The check of one robot. ``rows`` and ``report`` hold the result."""
 
     first = CHECK
 
@@ -57,7 +58,7 @@ class JointCheck(States):
         robot: Robot,
         limits: Limits,
     ) -> None:
-        """Raises RobotError if this robot cannot be moved softly."""
+        """Raises RobotError if the robot cannot move softly."""
         if not robot.can_change_gains:
             raise RobotError(
                 f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved"
@@ -73,7 +74,7 @@ class JointCheck(States):
 
     @property
     def right(self) -> bool:
-        """Whether every joint is."""
+        """True if every joint is right."""
         return len(self.rows) == len(self.joints) and all(row.verdict == "right" for row in self.rows)
 
     def step(self, measured: Measurement, now: float) -> Order:
@@ -120,7 +121,7 @@ class JointCheck(States):
                 return
 
     def _one(self, joint: int, pose: Floats) -> Moves:
-        """Up, a while there, and back; downwards where there is more room."""
+        """Move a joint up, hold, and move it back; downwards if there is no room above."""
         contract, limits, gains, to = self.controller.contract, self._limits, np.ones(len(pose)), pose.copy()
         top = min(limits.high[joint], limits.highest[joint])
         step = STEP if pose[joint] + STEP <= top else -STEP
@@ -167,14 +168,17 @@ class JointCheck(States):
         return "right" if tilts else "WRONG SIGN OR JOINT: the body did not tilt as this joint tilts it"
 
     def _other(self, joint: int, moved: Floats) -> int:
-        """The other joint that moved most."""
+        """The other joint with the largest motion."""
         return int(np.argmax(np.where(np.arange(len(moved)) == joint, 0.0, np.abs(moved))))
 
     def _tilts(self, joint: int, before: Measurement, there: Measurement, back: Measurement) -> bool:
-        """False if the body tilted, there and back, otherwise than one that hangs freely: its centre of mass stays below the rope."""
+        """False if the body tilts another way, there and back, than a freely hanging one.
+
+        Its centre of mass must stay below the rope.
+        """
         model, data, centres = self._model, mujoco.MjData(self._model), []
         for measured in (before, there):
-            data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)  # in the body's frame, as gravity is
+            data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)  # body frame, as gravity is
             data.qpos[[model.joint(name).qposadr[0] for name in self.joints]] = measured.joint_pos
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
@@ -194,7 +198,7 @@ class JointCheck(States):
 
     @property
     def report(self) -> str:
-        """A line a joint, and one of the whole; begins with a new line."""
+        """A line per joint and a summary; begins with a newline."""
         width = max(map(len, self.joints))
         form = f"{{:<{width}}} {{:>5}} {{:>6}} {{:>6}} {{:>9}}  {{:<{width + 7}}} {{}}"
         lines = [form.format("joint", "motor", "asked", "moved", "stiffness", "most of the others", "verdict")]

@@ -1,8 +1,8 @@
-"""The log of a run on one robot: what was measured, seen, done and asked, when, and each trip, in one compressed file.
+"""The log of a run on one robot, in one compressed file: measurements, observations, actions, commands, trips.
 
-The file is a row of blocks, each a length (8 bytes, little-endian) and an .npz of so many bytes: a header with the export's own
-files, then the columns of CHUNK steps at a time. A process that dies loses the last chunk alone. Nothing in it is code: it is read
-without pickle.
+The file is a sequence of blocks. A block is its length (8 bytes, little-endian) and an .npz of that length: first a
+header with the export's files, then the columns of CHUNK steps at a time.
+A process that dies loses only the last chunk. The file holds no code and is read without pickle.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import check_name
 
 FORMAT = 1
-CHUNK = 100  # steps a block
-BACKLOG = 60  # blocks that wait to be written: a slow disk must not fill the memory
+CHUNK = 100  # steps per block
+BACKLOG = 60  # blocks in the queue; more would fill the memory if the disk is slow
 SUFFIX = ".lmwlog"
-# files of an export that a log holds, if they are there
+# files of an export to copy into a log, if they exist
 EXPORT = (CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, MOTORS_FILE, MOTION_FILE, TERRAIN_FILE)
 _LENGTH = struct.Struct("<Q")
 
 
 class LogError(UserError, ValueError):
-    """A file that is no log, or cannot be written."""
+    """A file that is not a log, or cannot be written."""
 
 
 def log_path(contract: Contract, folder: Path = Path("logs/deploy")) -> Path:
-    """Where a run is logged that was not told where."""
+    """Default path of a run's log."""
     return (
         folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
     )
 
 
 def _columns(contract: Contract) -> dict[str, int]:
-    """Values a step: times [s], the state's place in STATES, the controller's rows, then the measurement's parts."""
+    """Values per step: times [s], index of the state in STATES, the controller's rows, the parts of the measurement."""
     joints = len(contract.joints)
     return {
         **dict.fromkeys(("time", "behind", "work", "age", "state", "voltage"), 1),
@@ -72,14 +72,14 @@ def _columns(contract: Contract) -> dict[str, int]:
 
 
 class Log:
-    """Writes a run's log; a thread of its own compresses and writes, so a step only copies numbers."""
+    """Writes the log of a run. A separate thread compresses and writes, so a step only copies numbers."""
 
     def __init__(
         self, path: Path, contract: Contract, folder: Path, robot: str, say: Callable[[str], None] = print
     ) -> None:
-        """Begin the file. Raises LogError if it cannot be written. ``say`` is told, once, if that ends later."""
+        """Create the file. Raises LogError if that fails. ``say`` gets one line if writing fails later."""
         self.path, self.contract, self._say = path, contract, say
-        self.broken = ""  # why nothing more can be written
+        self.broken = ""  # why writing stopped
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("xb")
@@ -97,7 +97,7 @@ class Log:
         files = {name: np.fromfile(folder / name, np.uint8) for name in EXPORT if (folder / name).is_file()}
         self._blocks.put({"header": header, **files})
         self._events: list[tuple[float, str]] = []
-        self._lost = 0  # steps
+        self._lost = 0  # steps not written
         self._begin()
         self._thread = threading.Thread(target=self._write, name="log", daemon=True)
         self._thread.start()
@@ -105,7 +105,7 @@ class Log:
     def add(
         self, loop: Loop, controller: Controller, measured: Measurement, health: Health, order: Order, command: Floats
     ) -> None:
-        """One step. What there was none of is NaN."""
+        """Log one step. Missing values are NaN."""
         nothing, contract = np.nan, self.contract
         targets, acts = order.targets is not None, order.state == POLICY
         stiffness = contract.stiffness if order.stiffness is None else order.stiffness
@@ -122,7 +122,7 @@ class Log:
                 "action": controller.last_actions[0] if acts else nothing,
                 "wanted": controller.last_targets[0] if acts else nothing,
             },
-            "target": order.targets if targets else nothing,  # as the servos got it
+            "target": order.targets if targets else nothing,  # as sent to the servos
             **{"stiffness": stiffness if targets else nothing, "damping": damping if targets else nothing},
             ESTIMATE: _believed(controller) if acts else nothing,
         }
@@ -138,11 +138,11 @@ class Log:
             self._hand_over()
 
     def event(self, now: float, text: str) -> None:
-        """A trip, or something else to say of a moment."""
+        """Log a trip or another event at time ``now`` [s]."""
         self._events.append((now, text))
 
     def close(self) -> None:
-        """Write the rest; again is allowed."""
+        """Write the rest. Safe to call twice."""
         if self._thread.is_alive():
             self._hand_over(last=True)
             self._blocks.put(None)
@@ -156,7 +156,7 @@ class Log:
         }
 
     def backlog(self) -> int:
-        """Blocks that wait to be written."""
+        """Number of blocks in the queue."""
         return self._blocks.qsize()
 
     def _hand_over(self, last: bool = False) -> None:
@@ -181,13 +181,13 @@ class Log:
                     self._file.write(_LENGTH.pack(buffer.tell()) + buffer.getvalue())
                     self._file.flush()
                     steps += len(block.get("time", ()))
-        except OSError as error:  # a full disk; the robot walks on
+        except OSError as error:  # a full disk; the robot keeps walking
             self.broken = f"the log {shown(self.path)} ends after {steps} steps: {error.strerror or error}"
             self._say(self.broken)
 
 
 def _believed(controller: Controller) -> Any:
-    """The rows of an estimate side by side, as of the last step."""
+    """The rows of the last estimate, side by side."""
     rows = [controller.estimate(row.name) for row in controller.contract.estimate]
     known = [row[0] for row in rows if row is not None]
     return np.concatenate(known) if known else np.nan
@@ -199,7 +199,7 @@ def _or_nan(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class DriveLog:
-    """A log that was read."""
+    """The content of a log."""
 
     header: dict[str, Any]
     files: dict[str, bytes]  # of the export: name -> content
@@ -208,7 +208,7 @@ class DriveLog:
 
 
 def read_log(path: Path) -> DriveLog:
-    """The whole log; a last block that was cut off is left out. Raises LogError."""
+    """Read the log, without a truncated last block. Raises LogError."""
     try:
         first, *blocks = _blocks(path)
         header = json.loads(str(first["header"]))

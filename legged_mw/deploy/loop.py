@@ -1,6 +1,7 @@
-"""Keeps the time of a control loop: absolute deadlines, what they were missed by, and no garbage collection within a step.
+"""The clock of a control loop: absolute deadlines, lateness, and no garbage collection within a step.
 
-Deadline k is start + k * period, whatever a step took, so the loop does not drift. It knows neither robot nor policy.
+Deadline k is start + k * period, however long a step took, so the loop does not drift.
+Nothing here knows a robot or a policy.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-LATE = 0.5  # [periods] by which a step may begin late before it is counted
-KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst is of the whole run
-_PRIORITY = 20  # ours, of 1 to 99: above all that is not real time, below a kernel's own threads
-_YIELD = 5e-4  # [s] for which another thread may keep the interpreter; Python's own 5 ms would be a late step
-# [s] of waiting that must be left for a collection: it takes 0.1 ms, as frozen objects are not looked at
+LATE = 0.5  # [periods]; a step that begins later counts as late
+KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst is that of the whole run
+_PRIORITY = 20  # ours, of 1 to 99: above everything that is not real time, below a kernel's own threads
+_YIELD = 5e-4  # [s] that another thread may hold the interpreter; Python's own 5 ms would make a step late
+# [s] of waiting that a collection needs; it takes 0.1 ms, as frozen objects are skipped
 _SPARE = 0.003
 
 
@@ -33,7 +34,7 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: NDArray[Any] | Sequence[float]) -> Spread:
-        """Of at least one value [s]."""
+        """The spread of at least one value [s]."""
         return cls(*(float(value) for value in np.percentile(values, (50, 99, 100))))
 
     def __str__(self) -> str:
@@ -41,13 +42,13 @@ class Spread(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How a loop kept its time."""
+    """How well a loop kept its time."""
 
     jitter: Spread  # how late steps began
-    work: Spread  # what a step took
+    work: Spread  # duration of a step
     steps: int
     late: int  # steps that began more than LATE periods late
-    lost: int  # periods that were left out, since the step before took longer
+    lost: int  # periods skipped because the step before took longer
 
     def __str__(self) -> str:
         lost = f", {self.lost} periods left out" if self.lost else ""
@@ -55,10 +56,11 @@ class Timing(NamedTuple):
 
 
 class _Samples:
-    """The last KEPT values, their worst ever; memory is fixed."""
+    """The last KEPT values and the worst value ever. Memory is fixed."""
 
     def __init__(self) -> None:
-        self.values = np.full(KEPT, 0.0, dtype=np.float32)  # in memory now: zeros() would be taken page by page
+        # allocated now: zeros() would be paged in later, in the middle of a run
+        self.values = np.full(KEPT, 0.0, dtype=np.float32)
         self.count, self.worst = 0, 0.0
 
     def add(self, value: float) -> None:
@@ -73,9 +75,10 @@ class _Samples:
 
 
 def real_time(priority: int, heirs: bool = False) -> tuple[int, Any] | None:
-    """Have the system run this thread before all that is not real time, round robin at ``priority`` of 1 to 99.
+    """Run this thread before everything that is not real time: round robin at ``priority``, 1 to 99.
 
-    ``heirs``: also the threads that it starts from now on. Returns how it was run before; None where it may not ask, or on no Linux.
+    ``heirs``: also the threads that it starts from now on.
+    Returns the scheduling before; None without the permission, or on another system than Linux.
     """
     try:
         before = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -86,22 +89,23 @@ def real_time(priority: int, heirs: bool = False) -> tuple[int, Any] | None:
 
 
 class Loop:
-    """Gives the time of each step, in ``ticks``. ``live``: in real time; else it never waits, and leaves the garbage collector alone.
+    """Keeps the time of each step, in ``ticks``.
 
-    As a context it keeps the collector from running within a step; it collects while it waits. It asks the system for real-time
-    priority, and goes on without where that is not allowed.
+    ``live``: in real time; else it never waits and leaves the garbage collector alone.
+    As a context it collects garbage while it waits, never within a step.
+    It requests real-time priority from the system, and goes on without it where that is not allowed.
     """
 
     def __init__(self, period: float, live: bool = True) -> None:
         self.period, self.live = period, live
-        self.now = 0.0  # [s] of the step since the first one, a multiple of the period
-        self.behind = 0.0  # [s] by which this step began late
+        self.now = 0.0  # [s] from the first step to this one, a multiple of the period
+        self.behind = 0.0  # [s] that this step began late
         self.work = 0.0  # [s] that the step before took
         self.steps = self.late = self.lost = 0
         self._tick, self._start, self._began = -1, 0.0, 0.0
         self._jitter, self._work = _Samples(), _Samples()
-        self._before = False, 0.0  # whether the collector ran, and how long threads kept the interpreter [s]
-        self._scheduled: tuple[int, Any] | None = None  # as the system ran this thread
+        self._before = False, 0.0  # garbage collector on; [s] that threads may hold the interpreter
+        self._scheduled: tuple[int, Any] | None = None  # this thread's scheduling before
 
     def __enter__(self) -> Loop:
         if self.live:
@@ -121,24 +125,24 @@ class Loop:
                 gc.enable()
             if self._scheduled:
                 policy, parameters = self._scheduled
-                # only root may take that flag back
+                # only root may clear that flag again
                 os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
 
     def ticks(self, seconds: float = math.inf) -> Iterator[float]:
-        """The time [s] of each step for ``seconds``, when it is due, or at once if it is late.
+        """The time [s] of each step for ``seconds``: when it is due, or at once if it is late.
 
-        A deadline that is missed by a whole period is left out.
+        A deadline missed by a whole period is skipped.
         """
         while self._wait() < seconds - 1e-9:
             self.steps += 1
             yield self.now
 
     def timing(self) -> Timing:
-        """So far."""
+        """Timing up to now."""
         return Timing(self._jitter.spread(), self._work.spread(), self.steps, self.late, self.lost)
 
     def _wait(self) -> float:
-        """Time of the next step, when it begins."""
+        """Wait for the next step and return its time."""
         self._tick += 1
         self.now = self._tick * self.period
         if not self.live:
@@ -166,4 +170,4 @@ class Loop:
         due = self._start + self.now
         if due - ended > _SPARE:
             gc.collect()
-        time.sleep(min(self.period, max(0.0, due - time.perf_counter())))  # no more, should the clock go back
+        time.sleep(min(self.period, max(0.0, due - time.perf_counter())))  # a clock set back must not wait longer

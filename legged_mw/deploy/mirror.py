@@ -1,7 +1,7 @@
-"""A robot that is driven, in a window or on a web page: its measured joints, its state and why, and one button, which damps it.
+"""A live view of a driven robot, in a window or on a web page: its joints, its state and why, and one button: damp.
 
-The picture is made by a process of its own, so it delays no step, and a viewer that is closed or dies stops nothing. It does not
-drive: a browser may close without notice. Where the robot is in the picture follows from its velocity, if that is known.
+A separate process draws, so the view delays no step; closing it stops nothing. It cannot drive, since a browser may
+close without notice. The robot's place in the view is integrated from its velocity, if known.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -34,21 +34,21 @@ from legged_mw.view.drive import Pilot
 from legged_mw.view.session import Session, signed
 from legged_mw.view.stage import ViewError
 
-RATE = 25.0  # [Hz] of pictures
+RATE = 25.0  # [Hz] of frames
 START = 30.0  # [s] for a viewer to open
 # the only actions, each with its label; "": the label of BINDINGS
 ACTIONS = {"reset": "Damp", "camera": "", "help": ""}
 DAMP = b"damp"
-_PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # of a measurement
+_PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # fields of a measurement
 FLAGS = ("viewer", "camera", "host", "port")
-LIVE = ("native", "web")  # of --viewer
+LIVE = ("native", "web")  # live values of --viewer
 
 
 class RobotMonitor:
-    """The end in the robot's program. It is a source of commands, too (``inputs.Source``), whose only command is to damp."""
+    """The robot program's end of the view. It is also an input source (``inputs.InputSource``): it can only damp."""
 
     def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
-        """Open the viewer that ``args`` name (see ``launch.add_flags``). Raises ViewError."""
+        """Open the viewer in ``args`` (see ``launch.add_flags``). Raises ViewError."""
         settings = {"folder": str(folder.resolve()), **{name: getattr(args, name) for name in FLAGS}}
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -56,7 +56,7 @@ class RobotMonitor:
         with theirs:
             settings["channel"] = theirs.fileno()
             command = [sys.executable, "-c", program, json.dumps(settings)]
-            # Ctrl-C must not end it
+            # Ctrl-C must not end the viewer
             self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)
         problem = self._problem()
         self._channel.setblocking(False)
@@ -65,7 +65,7 @@ class RobotMonitor:
             raise ViewError(problem)
 
     def _problem(self) -> str:
-        """Wait for the viewer: why it did not open, or an empty string."""
+        """Wait for the viewer. Returns why it did not open, or an empty string."""
         end, alive = time.monotonic() + START, True
         self._channel.settimeout(0.1)
         while alive:
@@ -77,10 +77,10 @@ class RobotMonitor:
     def begin(self, contract: Contract, channel: socket.socket) -> None:
         """Send the robot's state through ``channel`` from now on."""
         self._period, self._channel, self._due, self._health = contract.period, channel, 0.0, Health()
-        self._x = self._y = self._heading = 0.0  # [m], [rad] since the start
+        self._x = self._y = self._heading = 0.0  # [m], [m], [rad] since the start
 
     def show(self, now: float, measured: Measurement | None, states: States) -> None:
-        """Called each step; sends the state RATE times a second."""
+        """Call once a step; it sends the state RATE times a second."""
         if measured is not None:
             vx, vy, rate = (float(value) for value in (*measured.lin_vel[:2], -measured.gravity @ measured.ang_vel))
             if math.isfinite(vx + vy + rate):
@@ -101,7 +101,7 @@ class RobotMonitor:
         message["hottest"] = None if health.temperatures is None else float(health.temperatures.max())
         if measured is not None:
             message |= {name: getattr(measured, name).tolist() for name in _PARTS}
-        with suppress(OSError):  # the viewer was closed, or is busy
+        with suppress(OSError):  # the viewer is closed or busy
             self._channel.send(json.dumps(message).encode())
 
     def poll(self, health: Health) -> DriveInput:
@@ -123,17 +123,17 @@ class RobotMonitor:
 
 
 class MirroredStage:
-    """The robot's latest state, as a stage (the viewers' protocol ``Stage``). It steps nothing."""
+    """The robot's latest state, as a stage (the viewers' protocol ``Stage``). It steps no physics."""
 
     num_worlds, dt = 1, 1.0 / RATE
 
     def __init__(self, folder: Path, channel: socket.socket) -> None:
-        self.contract = read_contract(folder, edited=True)  # the robot's program has looked at it
-        scene = read_scene(folder, self.contract, whole=True)  # it may lie on the ground
+        self.contract = read_contract(folder, edited=True)  # the robot's program has checked it
+        scene = read_scene(folder, self.contract, whole=True)  # the robot may lie on the ground
         self.spec, self._model, self._data, self._channel = scene.spec, scene.model, mujoco.MjData(scene.model), channel
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         self.command_table, self._parent = self.contract.commands, os.getppid()
-        # the foot of each geom of the feet, in the order of the sensors
+        # index of the foot of each foot geom, in the order of the sensors
         self._foot = [
             foot
             for _, foot in sorted(
@@ -143,7 +143,7 @@ class MirroredStage:
         self.latest: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
 
     def step(self, commands: Floats | None) -> None:
-        """Take the newest message. The process ends with the robot's program."""
+        """Take the newest message. This process ends with the robot's program."""
         newest = None
         with suppress(BlockingIOError):
             while data := self._channel.recv(1 << 16):
@@ -188,7 +188,7 @@ class MirroredStage:
     def push(self, world: int, velocity: Floats) -> None: ...
 
     def reset(self, world: int) -> None:
-        """The button was pressed."""
+        """The button was pressed: damp the robot."""
         with suppress(OSError):
             self._channel.send(DAMP)
 
@@ -220,7 +220,7 @@ def main() -> None:
     settings = json.loads(sys.argv[1])
     channel = socket.socket(fileno=settings["channel"])
     channel.setblocking(False)
-    os.nice(5)  # the robot goes first
+    os.nice(5)  # the robot's program has priority
     args = argparse.Namespace(**{name: settings[name] for name in FLAGS})
     try:
         stage = MirroredStage(Path(settings["folder"]), channel)

@@ -1,9 +1,10 @@
-"""Leg odometry: the velocity of the IMU [m/s] from joints, gyro, accelerometer and the feet that stand. No robot, no policy.
+"""Leg odometry: the velocity of the IMU [m/s] from joints, gyro, accelerometer and standing feet.
 
-The velocity part of the filter of Bledt et al., "MIT Cheetah 3: Design and Control of a Robust, Dynamic Quadruped Robot", IROS 2018.
-Predicted by the accelerometer; corrected by each foot on the ground, which does not move there, so that the body moves by what
-the leg does. Places of the body and of the feet are left out: so the ground may have any height, and the noise of all three axes
-is one number. Ours: a foot that is at odds with the prediction counts less, as it slips or just touches down (Cauchy's weight).
+The velocity part of the filter of Bledt et al., "MIT Cheetah 3: Design and Control of a Robust, Dynamic Quadruped
+Robot", IROS 2018. The accelerometer predicts the velocity. Each standing foot corrects it: the foot does not move, so
+the leg's motion is the body's motion. The state has no positions of body or feet, so the ground may have any height,
+and one number is the variance of all three axes. Ours: a foot that disagrees with the prediction counts less, as it
+slips or just touches down (Cauchy's weight). Nothing here depends on a robot class or a policy.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -23,32 +24,32 @@ from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import read_scene
 
 ROW = "lin_vel"  # ContractRow.measured of the velocity
-# Ours, as those below: tried in the walking exam of go1_flat, with the noise of sensors and without. Less DRIFT and DOUBT is calmer, and
-# slower to notice what no accelerometer feels: a shock between two measurements.
+# The noises are ours, tuned in the walking exam of go1_flat with and without sensor noise. Smaller DRIFT and DOUBT give
+# a calmer estimate. It is then slower to notice a shock between two measurements, which no accelerometer feels.
 DRIFT = 4.0  # [m/s^2] noise of the accelerometer over a period
-STANDING = 0.2  # [m/s] noise of the velocity of a foot that stands
-# [m/s] from which a foot that moves counts half, by how sure its contact is
+STANDING = 0.2  # [m/s] velocity noise of a standing foot
+# [m/s] foot speed at which a foot counts half, by the source of its contact
 DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}
-CONTACTS = tuple(DOUBT)  # how a foot on the ground is found
-LOADED = 0.1  # [weights] of a foot's force from which it stands, by its joints' torques
-CARRIES = 0.6  # [weights] of all feet together from which a robot stands by itself: on no belly, on no rope
-LEVEL = 0.01  # [m] above the lowest foot, within which others stand too, by their height
-FLAT = 0.05  # [-] sine of a foot's tilt up to which it touches between its ends, not at one of them
+CONTACTS = tuple(DOUBT)  # sources of foot contact
+LOADED = 0.1  # [weights] force of a standing foot, at least, from joint torques
+CARRIES = 0.6  # [weights] force of all feet, at least, of a robot on its feet alone, not on its belly or a rope
+LEVEL = 0.01  # [m] feet within this height of the lowest foot stand, too, if height is the source of contact
+FLAT = 0.05  # [-] sine of the tilt up to which a foot lies flat, not on one of its ends
 
 
 class Legs(NamedTuple):
-    """Of the feet of N robots, in the frame of the IMU."""
+    """The legs of N robots, in the IMU's frame."""
 
     place: Floats  # (N, F, 3) [m] from the IMU to the foot's lowest point
-    velocity: Floats  # (N, F, 3) [m/s] of the IMU, if the foot does not move
-    force: Floats  # (N, F) [N] with which a leg presses down, by its joints' torques
+    velocity: Floats  # (N, F, 3) [m/s] velocity of the IMU, if the foot stands still
+    force: Floats  # (N, F) [N] downward force of the leg, from joint torques
 
 
 class Odometry:
-    """Estimates the velocity of ``count`` robots, one measurement a period."""
+    """Estimates the velocity of ``count`` robots, from one measurement a period."""
 
     def __init__(self, folder: Path, contract: Contract, count: int = 1, contact: str = "measured") -> None:
-        """``contact``: of CONTACTS. Raises ContractError."""
+        """``contact``: the source of foot contact, of CONTACTS. Raises ContractError."""
         if not contract.feet:
             raise ContractError(f"{CONTRACT_FILE}: robot: feet is empty; leg odometry needs feet")
         self.contract, self.contact, self._doubt, scene = (
@@ -63,17 +64,17 @@ class Odometry:
         self._imu = int(self.model.site(contract.imu).id)
         self._feet = [_Foot(self.model, names) for names in contract.feet.values()]
         self._gravity = float(np.linalg.norm(self.model.opt.gravity))
-        self.velocity: Floats = np.zeros((count, 3))  # [m/s] body frame
-        self._variance: Floats = np.zeros(count)  # [m^2/s^2] of it, the same along each axis
-        self._shock: Floats = np.full((count, 3), np.nan)  # [m/s^2] the accelerometer before
+        self.velocity: Floats = np.zeros((count, 3))  # (N, 3) [m/s] body frame
+        self._variance: Floats = np.zeros(count)  # (N,) [m^2/s^2] its variance, equal in all axes
+        self._shock: Floats = np.full((count, 3), np.nan)  # (N, 3) [m/s^2] last accelerometer value
         self.reset()
 
     def reset(self, which: Any = slice(None)) -> None:
-        """The robots ``which`` (indices or a mask) are at rest."""
+        """Set the robots ``which`` (indices or a mask) to rest."""
         self.velocity[which], self._variance[which], self._shock[which] = 0.0, self._doubt**2, np.nan
 
     def __call__(self, measured: Measurement) -> Measurement:
-        """``measured`` of N robots (or of one, without the leading axis) with the estimate in the place of its velocity."""
+        """``measured`` with the estimate as its velocity. N robots; one robot needs no leading axis."""
         gyro, gravity, felt = (
             np.atleast_2d(each) for each in (measured.ang_vel, measured.gravity, measured.acceleration)
         )
@@ -90,11 +91,11 @@ class Odometry:
         pulled = velocity / variance[:, None] + (trust[..., None] * legs.velocity).sum(axis=1)
         found = pulled * self._variance[:, None]
         self.velocity = found.copy()
-        self.reset(~np.isfinite(found).all(axis=1))  # what is not finite is handed on, and forgotten
+        self.reset(~np.isfinite(found).all(axis=1))  # an estimate that is not finite is returned once, then reset
         return replace(measured, lin_vel=found.reshape(np.shape(measured.lin_vel)))
 
     def stands(self, measured: Measurement, legs: Legs) -> NDArray[np.bool_]:
-        """Feet (N, F) that are taken to stand."""
+        """Standing feet (N, F), by the source of contact."""
         if self.contact == "measured":
             return np.atleast_2d(measured.foot_contact) > 0.0
         if self.contact == "torque":
@@ -103,14 +104,14 @@ class Odometry:
         return depth > depth.max(axis=1, keepdims=True) - LEVEL
 
     def legs(self, measured: Measurement) -> Legs:
-        """Where feet are, how the body moves if they do not, and how hard they press, by the scene's kinematics."""
+        """Foot places, body velocities from still feet, and foot forces, from the scene's kinematics."""
         parts = (measured.joint_pos, measured.joint_vel, measured.joint_torque, measured.ang_vel, measured.gravity)
         return Legs(*map(np.array, zip(*map(self._legs, *map(np.atleast_2d, parts)), strict=True)))
 
     def down(self, measured: Measurement) -> Floats:
-        """(3,) what the legs say of gravity: across the plane of the feet, so down on level ground. NaN unless three feet or more carry it.
+        """Gravity's direction (3,) from the legs of one robot: the normal of the feet's plane, so down on level ground.
 
-        Of one robot; nothing of its IMU is looked at.
+        NaN unless three feet or more carry the robot. It reads nothing of the IMU.
         """
         legs = self.legs(replace(measured, gravity=np.array([0.0, 0.0, -1.0]), ang_vel=np.zeros(3)))
         weight = self.contract.mass * self._gravity
@@ -121,7 +122,7 @@ class Odometry:
         return across * np.sign(across @ place.mean(axis=0))
 
     def leaning(self, angles: Floats, axis: Floats) -> Floats:
-        """(D,) how far each joint turns while the body turns by 1 rad about ``axis`` (3,) over feet that stay."""
+        """(D,) [rad] turn of each joint per 1 rad of body turn about ``axis`` (3,), over feet that stay."""
         place, slopes = self._feet_of(angles, np.array([0.0, 0.0, -1.0]))
         found = np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
         return np.array(found, dtype=float)
@@ -129,7 +130,7 @@ class Odometry:
     def _legs(
         self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Of one robot, without the leading axis."""
+        """The legs of one robot, without the leading axis."""
         place, slopes = self._feet_of(angles, gravity)
         wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[
             ..., 0
@@ -137,7 +138,7 @@ class Odometry:
         return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
 
     def _feet_of(self, angles: Floats, gravity: Floats) -> tuple[Floats, Floats]:
-        """Where feet are (F, 3), and how far they move by each joint (F, 3, D). The root stays where the model has it."""
+        """Foot places (F, 3) and their derivatives by each joint (F, 3, D). The root stays where the model has it."""
         model, data = self.model, self._data
         data.qpos[self._angles] = angles
         mujoco.mj_kinematics(model, data)
@@ -152,10 +153,10 @@ class Odometry:
 
 
 class _Foot:
-    """Shapes of one foot: a centre each, half edges along its own axes, and a radius around all that."""
+    """The shapes of one foot: a centre each, half edges along its own axes, and a radius around them."""
 
     def __init__(self, model: mujoco.MjModel, sensors: tuple[str, ...]) -> None:
-        """``sensors`` of contact name its shapes."""
+        """``sensors`` of contact name the shapes."""
         self.geoms = [int(model.sensor(name).objid[0]) for name in sensors]
         self.body = int(model.geom_bodyid[self.geoms[0]])
         kinds, sizes, boxes = model.geom_type[self.geoms], model.geom_size[self.geoms], model.geom_aabb[self.geoms]
@@ -166,7 +167,7 @@ class _Foot:
         self.half[rod] = np.stack([0.0 * sizes[rod, 0], 0.0 * sizes[rod, 0], sizes[rod, 1]], axis=1)
 
     def lowest(self, data: Any, down: Floats) -> Floats:
-        """(3,) the foot's point that is farthest along ``down``."""
+        """The foot's farthest point (3,) along ``down``."""
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         ends = self.centre + self.half * np.clip(down @ turns / FLAT, -1.0, 1.0)
         points = data.geom_xpos[self.geoms] + (turns @ ends[..., None])[..., 0] + self.radius[:, None] * down

@@ -1,7 +1,7 @@
-"""A log beside the simulation of the same commands: torque, joint errors, velocity and latency, as a table and a picture.
+"""Compare a log with a simulation of the same commands: torques, joint errors, velocity and latency, as table and plot.
 
-The simulation starts where the policy began on the robot: its joints, its tilt, at the same speed, on level ground. Its targets are
-held as the robot's were.
+The simulation starts where the policy began on the robot: same joints, tilt and speed, on level ground. Its targets are
+clipped as the robot's were.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -28,16 +28,16 @@ from legged_mw.deploy.states import POLICY, STATES
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.errors import UserError, shown
 
-LAGS = 12  # [periods] in which a target is looked for in the torque
-MOVES = 0.02  # [rad] a target whose deviation is less tells no latency
-EXPLAINED = 0.5  # [share] of a torque that its servo must explain to tell a latency
-SHORTEST = 50  # steps of the policy that can be compared
+LAGS = 12  # [periods] largest latency
+MOVES = 0.02  # [rad] standard deviation below which a target shows no latency
+EXPLAINED = 0.5  # [share] of a torque's variance that the servo must explain to give a latency
+SHORTEST = 50  # policy steps, at least, for a comparison
 AXES = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
 Rows = dict[str, Floats]  # name -> (T, values)
 
 
 class Replay(NamedTuple):
-    """The longest walk of a log, and the simulation of it; both have T rows, or the simulation fewer if it fell."""
+    """The longest walk in a log and its simulation. Both have T rows; the simulation fewer if it fell."""
 
     contract: Contract
     recording: DriveLog
@@ -46,9 +46,9 @@ class Replay(NamedTuple):
 
 
 def replay(path: Path, folder: Path | None = None, edited: bool = False) -> Replay:
-    """Simulate the longest walk in a log with the export in ``folder`` (None: the one in the log). Raises LogError, ContractError.
+    """Simulate the longest walk in a log with the export in ``folder`` (None: the one in the log).
 
-    ``edited``: see read_contract.
+    ``edited``: see read_contract. Raises LogError, ContractError.
     """
     recording = read_log(path)
     with tempfile.TemporaryDirectory() as own:
@@ -80,7 +80,7 @@ def _longest(on: Any) -> slice:
 
 
 def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
-    """The same steps on the simulated robot, until it falls."""
+    """Simulate the same steps until the robot falls."""
     robot, controller, safety = (
         MujocoRobot(folder, contract),
         Controller(folder, contract),
@@ -101,7 +101,7 @@ def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
 
 
 def _pose(robot: MujocoRobot, start: Rows) -> None:
-    """Put the simulated robot where the real one was, its lowest foot on the ground."""
+    """Put the simulated robot into the real one's pose, its lowest foot on the ground."""
     fleet, contract = robot.fleet, robot.fleet.contract
     data = mujoco.MjData(fleet.model)
     data.qpos[:] = fleet.qpos[0]
@@ -117,10 +117,10 @@ def _pose(robot: MujocoRobot, start: Rows) -> None:
 
 
 def latency(rows: Rows, contract: Contract) -> Floats:
-    """(D,) [s] from a target to the measurement whose torque follows it: the lag at which the servo's law fits best.
+    """Latency (D,) [s] from a target to the measured torque: the lag at which the servo's law fits best.
 
-    torque = stiffness * (target - angle) - damping * speed, with the contract's stiffness; damping is fitted, as not every robot has it
-    in its torque. Where no lag explains the torque, or the target hardly moves, it is NaN.
+    torque = stiffness * (target - angle) - damping * speed. Stiffness is the contract's; damping is fitted, as some
+    robots leave it out of the measured torque. NaN if no lag explains the torque, or if the target hardly moves.
     """
     columns = zip(
         *(rows[name].T for name in ("target", "joint_pos", "joint_vel", "joint_torque")),
@@ -131,7 +131,10 @@ def latency(rows: Rows, contract: Contract) -> Floats:
 
 
 def _lag(target: Floats, angle: Floats, speed: Floats, torque: Floats, stiffness: float) -> float:
-    """[periods] of one joint. Between two whole lags: the share of steps, about, in which the older target was still in force."""
+    """Lag [periods] of one joint.
+
+    A fraction between two whole lags is about the share of steps in which the older target was still in force.
+    """
     if len(target) <= 2 * LAGS or target.std() < MOVES or not torque.any():
         return math.nan
     lagged = [target[LAGS - lag : len(target) - lag] for lag in range(LAGS + 1)]
@@ -160,7 +163,7 @@ def _lin_vel(rows: Rows, contract: Contract) -> Floats:
 
 
 def figures(rows: Rows, contract: Contract) -> dict[str, Floats]:
-    """What is compared, each (D,) or (3,)."""
+    """The compared figures, (D,) or (3,) each."""
     velocity = np.concatenate([_lin_vel(rows, contract)[:, :2], rows["ang_vel"][:, 2:]], axis=1)
     return {
         "torque": _rms(rows["joint_torque"]),
@@ -178,7 +181,7 @@ def _title(replayed: Replay) -> str:
 
 
 def table(replayed: Replay) -> str:
-    """Robot beside simulation, a line a joint."""
+    """A table of robot and simulation, a line per joint."""
     contract, rows = replayed.contract, replayed.robot
     robot, simulated = figures(rows, contract), figures(replayed.simulated, contract)
 
@@ -210,7 +213,7 @@ def table(replayed: Replay) -> str:
 
 
 def draw(replayed: Replay, path: Path) -> None:
-    """Write the picture. Raises UserError where matplotlib is missing."""
+    """Write the plot. Raises UserError without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -254,7 +257,7 @@ def draw(replayed: Replay, path: Path) -> None:
 
 
 def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows, time: Floats) -> None:
-    """vx, vy, yaw rate: commanded, the robot's, the simulated one's."""
+    """Plot vx, vy and yaw rate: commanded, measured, simulated."""
     names, made = [each.name for each in contract.commands], len(simulated["target"])
     for i, (axes, title) in enumerate(zip(many, AXES, strict=True)):
         axes.set_title(title)

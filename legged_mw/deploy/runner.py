@@ -1,4 +1,7 @@
-"""The loop between a policy and a robot, at the contract's period. It knows neither the kind of robot nor the source of commands."""
+"""The control loop between a policy and a robot, at the contract's period.
+
+Nothing here depends on the kind of robot or on the source of commands.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,17 @@ from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotErro
 from legged_mw.deploy.safety import TORQUE, Limits, Safety, Trip, Tripped
 from legged_mw.deploy.states import DAMPING, POLICY, ZERO, Order, States
 
-_RECENT = 10.0  # [s] of velocities that are kept of a run without an end
+_RECENT = 10.0  # [s] of velocities that an endless run keeps
 
 
 @dataclass
 class Summary:
-    """What happened."""
+    """The outcome of a run."""
 
     steps: int = 0
-    late: int = 0  # steps that began more than half a period after their time
+    late: int = 0  # steps that began more than half a period late
     fell: float | None = None  # [s] of the fall that ended the walk, by the contract's `ends`
-    velocity: Floats | None = None  # (3,) mean of vx, vy [m/s], yaw rate [rad/s] over the second half
+    velocity: Floats | None = None  # (3,) mean of vx, vy [m/s] and yaw rate [rad/s] over the second half
     timing: Timing | None = None  # of a live run
     trips: list[Trip] = field(default_factory=list)  # of a run with states, which goes on damped
 
@@ -47,12 +50,15 @@ def run(
     log: Log | None = None,
     odometry: Odometry | None = None,
 ) -> Summary:
-    """Run for ``seconds``, or until the robot falls: read, decide, write, once a period; then close the robot, also after an error.
+    """Run for ``seconds``, or until the robot falls: read, decide and write once a period.
 
-    ``command`` gives (C,), in the contract's order, at a time [s] since the start; it is held within the trained ranges.
-    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement, or None.
-    ``safety``: other limits than the export's. A limit that is passed damps the robot and raises Tripped. ``odometry`` gives the velocity.
-    ``states``: begin at zero torque and do what they say, with their own commands; a trip or a fall damps and the run goes on.
+    It closes the robot at the end, also after an error.
+    ``command`` returns (C,), in the contract's order, at a time [s] since the start, clipped to the trained ranges.
+    ``live``: run in real time, as a robot needs; else as fast as the robot answers.
+    ``watch`` gets each measurement. With states it gets None for a step without one.
+    ``safety`` replaces the export's limits. Passing a limit damps the robot and raises Tripped.
+    ``states`` begin at zero torque and bring their own commands; a trip or a fall damps the robot and the run goes on.
+    ``odometry`` replaces the measured velocity by its estimate.
     """
     safety = safety or Safety(controller.contract, Limits.of(controller.folder, controller.contract, robot.limits))
     one, velocities = (
@@ -65,7 +71,7 @@ def run(
         loop = stack.enter_context(Loop(controller.contract.period, live))
         stack.enter_context(robot)
         controller.reset()
-        with suppress(*([KeyboardInterrupt] if states else [])):  # a person ends a run with states so
+        with suppress(*([KeyboardInterrupt] if states else [])):  # Ctrl-C is the normal end of a run with states
             for now in loop.ticks(seconds):
                 measured = one.take(loop)
                 if one.over:
@@ -82,7 +88,7 @@ def run(
 
 
 class _Velocities:
-    """The last half of a run's velocities, of a run without an end its last seconds: memory is fixed."""
+    """Velocities of the last half of a run, or of the last seconds of an endless one. Memory is fixed."""
 
     def __init__(self, period: float, seconds: float) -> None:
         self._kept: deque[list[float]] = deque(maxlen=math.ceil(min(seconds, 2 * _RECENT) / period / 2) + 1)
@@ -91,12 +97,12 @@ class _Velocities:
         self._kept.append([*measured.lin_vel[:2], measured.ang_vel[2]])
 
     def mean(self, steps: int) -> Floats | None:
-        """(3,) over the second half of ``steps``."""
+        """Mean (3,) over the second half of ``steps``."""
         return np.mean(list(self._kept)[-max(1, steps - steps // 2) :], axis=0) if self._kept else None
 
 
 class _Step:
-    """What happens once a period. Without states the policy acts at once, a trip raises and a fall ends the run."""
+    """One control period. Without states the policy acts at once, a trip raises and a fall ends the run."""
 
     def __init__(
         self,
@@ -125,11 +131,11 @@ class _Step:
 
     @property
     def over(self) -> bool:
-        """Whether the run ends with this step."""
+        """True if the run ends with this step."""
         return self.summary.fell is not None or (self.states is not None and self.states.over)
 
     def take(self, loop: Loop) -> Measurement | None:
-        """One step; returns what was measured, None if nothing could be."""
+        """Do one step. Returns the measurement, None if there is none."""
         measured, health, trip = self._sense(loop)
         if self.summary.fell is not None:
             return measured
@@ -137,7 +143,7 @@ class _Step:
         if trip:
             order = self._trip(trip, loop.now)
         else:
-            assert measured  # else there is a trip
+            assert measured  # no measurement always trips
             order = self._decide(measured, loop.now)
             if not self.robot.can_change_gains:
                 order = order._replace(stiffness=None, damping=None)
@@ -158,7 +164,7 @@ class _Step:
         return measured
 
     def _sense(self, loop: Loop) -> tuple[Measurement | None, Health, Trip | None]:
-        """What is measured, and why the robot must stop."""
+        """Measurement, health, and the reason to stop, if any."""
         measured, health, trip = None, Health(), None
         try:
             measured, health = self.robot.read(), self.robot.health()
@@ -185,13 +191,13 @@ class _Step:
             return Order(POLICY, self.controller.last_targets[0].copy())
         before, order = self.states.armed, self.states.step(measured, now)
         if self.odometry and not self.states.armed:
-            self.odometry.reset()  # it may lie, or hang
+            self.odometry.reset()  # its estimate may be wrong while the robot lies or hangs
         if self.states.armed and not before:
             self.safety.reset()
         return order
 
     def _trip(self, trip: Trip, now: float) -> Order:
-        """Damping, or the end of the run."""
+        """Damp the robot, or end a run without states."""
         if self.states is None:
             raise Tripped(trip)
         if self.states.state != DAMPING:

@@ -1,6 +1,6 @@
-"""The limits between any policy and any robot: each step is checked, and what is beyond a limit is named in one line.
+"""Limits between a policy and a robot: every step is checked, and a passed limit is one line of text.
 
-A trip is a sentence; the caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
+The caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -21,32 +21,34 @@ from legged_mw.deploy.loop import LATE
 from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
 
-TORQUE = "torque"  # an action's origin: its targets are torques
-OFF = math.inf  # a limit that is never passed
-# What no joint and no gyro measures; ours: wheels turn far, and gyros end at 35 rad/s. Also NaN and infinity are beyond it.
+TORQUE = "torque"  # origin of an action: its targets are torques
+OFF = math.inf  # a limit that is switched off
+# Values that no joint and no gyro can measure; NaN and infinity are beyond them, too.
+# Ours: wheels turn far, and gyros end at 35 rad/s.
 _ABSURD = {"joint_pos": (1e5, "rad"), "joint_vel": (1e4, "rad/s"), "ang_vel": (1e3, "rad/s")}
-# A part of a measurement that stands still to the last bit is frozen if meanwhile, within _ALONE * Limits.frozen measurements, another
-# part moved so far; ours: an encoder's or a gyro's smallest step is a hundredth of it, and a robot that stands moves less.
-_ALONE = 3.0  # 0.24 s at 50 Hz: a part with coarse steps may repeat for a while, the whole measurement may not
-_MOVED = 0.05  # [rad] of a joint by its speed, of the body by gyro or gravity, of a target while the body moves
-_SWUNG = 0.1  # [rad] of a joint, from which no gyro and no gravity stays the same
-_ASKED = 0.2  # [rad] of a joint's target, from which no encoder does
-_UNIT = 0.1  # by which the length of gravity may differ from 1; ours: a unit quaternion in float32 gives 1e-6
+# A sensor is frozen if its value stays the same, to the last bit, while another sensor shows motion.
+# Both are compared over _ALONE * Limits.frozen measurements. The thresholds of motion below are ours: the smallest step
+# of an encoder or a gyro is a hundredth of them, and a standing robot moves less.
+_ALONE = 3.0  # 0.24 s at 50 Hz: one coarse sensor may repeat its value for a while, the whole measurement may not
+_MOVED = 0.05  # [rad] moved: a joint by its speed, the body by gyro or gravity, a target while the body moves
+_SWUNG = 0.1  # [rad] moved by a joint: gyro and gravity must change
+_ASKED = 0.2  # [rad] moved by a joint's target: its encoder must change
+_UNIT = 0.1  # deviation of gravity's length from 1; ours: a unit quaternion in float32 gives 1e-6
 
 
 class LimitError(UserError, ValueError):
-    """A limit that does not exist, or a value that it cannot have."""
+    """An unknown limit, or a value that it cannot have."""
 
 
 class Trip(NamedTuple):
-    """What was beyond a limit."""
+    """A limit that was passed."""
 
-    limit: str  # its name: a field of Limits, or "finite", "stop", "robot"
-    text: str  # what and how much, in one line
+    limit: str  # name of the limit: a field of Limits, or "finite", "stop", "robot"
+    text: str  # what was measured, and the limit, in one line
 
 
 class Tripped(RobotError):
-    """A run that a trip ended; its robot is damped."""
+    """A trip ended the run; the robot is damped."""
 
     def __init__(self, trip: Trip) -> None:
         self.trip = trip
@@ -55,37 +57,42 @@ class Tripped(RobotError):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of D joints in the contract's order. The first five are the machine's; the others can be set by their names.
+    """Limits of D joints in the contract's order. The first five come from the machine; the others can be set by name.
 
-    Where no source is named the default is ours: what the shipped policies of Go1, Go2 and G1 need in the walking exam with its
-    pushes of 2 m/s (the figure in brackets), and a margin. Narrower ones for one robot or policy belong in its contract.
+    A default without a source is ours. It is what the shipped policies of Go1, Go2 and G1 need in the walking exam
+    with its pushes of 2 m/s (the figure in brackets), plus a margin. Tighter limits of one robot or policy belong in
+    its contract.
     """
 
-    low: Floats  # (D,) [rad] the joints' range
+    low: Floats  # (D,) [rad] range of the joints
     high: Floats  # (D,) [rad]
-    motor: Floats  # (D,) [N m] what the motors can give
-    lowest: Floats  # (D,) [rad] the contract's range: targets are held within it, as in training; no drive does it
+    motor: Floats  # (D,) [N m] largest torque of the motors
+    # (D,) [rad] range of the targets in the contract; `held` clips to it, as in training, since drives do not
+    lowest: Floats
     highest: Floats  # (D,) [rad]
-    position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops give]
+    position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops yield]
     target: float = 0.9  # [rad] of a target beyond the range [0.62]
-    step: float = 2.5  # [rad] between two targets of a joint [1.85]
-    torque: float = 2.0  # [share of `motor`] that the servo would ask for [1.52]
+    step: float = 2.5  # [rad] between two targets of a joint in a row [1.85]
+    torque: float = 2.0  # [share of `motor`] of a servo's computed torque [1.52]
     speed: float = 60.0  # [rad/s] of a joint [48]
-    # [deg] of the body, where the contract calls one up to 90 a fall; else what it calls a fall [30]
+    # [deg] of the body, or less if the contract calls less a fall; where a fall begins beyond 90 deg, that angle [30]
     tilt: float = 60.0
     temperature: float = 85.0  # [deg C] of a motor: below the 90 at which drives switch themselves off
-    voltage: float = -OFF  # [V] of the battery, at least; a robot's class states its own
-    age: float = 2.0  # [periods] of the newest measurement
-    frozen: float = 4.0  # measurements in a row that are the same, bit for bit
-    late: float = 5.0  # steps in a second that began more than half a period late
-    remote: float = 3.0  # [s] without the remote that was there [unitree_rl_lab]
+    voltage: float = -OFF  # [V] of the battery, at least; a robot's class sets its own
+    age: float = 2.0  # [periods] since the newest measurement
+    frozen: float = 4.0  # identical measurements in a row, bit for bit
+    late: float = 5.0  # steps in one second that began more than half a period late
+    remote: float = 3.0  # [s] since the remote was last received; only if it was there [unitree_rl_lab]
 
     @staticmethod
     def of(
         folder: Path, contract: Contract, robot: Mapping[str, Any] | None = None, asked: Mapping[str, Any] | None = None
     ) -> Limits:
-        """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then those that
-        the robot's class states, then what the command line asks."""
+        """The limits of the export in ``folder``.
+
+        Four sources, the later ones override: the scene (of the machine), the contract's section ``safety``,
+        ``robot`` (of its class), ``asked`` (of the command line).
+        """
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
         limits = replace(
             limits_of(compile_scene(part(folder, SCENE_FILE)), contract),
@@ -100,7 +107,7 @@ class Limits:
         return limits
 
     def but(self, values: Mapping[str, Any], where: str) -> Limits:
-        """With other values by name; "off" switches a limit off. Raises LimitError."""
+        """A copy with other values by name; "off" switches a limit off. Raises LimitError."""
         return replace(self, **{name: _value(name, value, where) for name, value in values.items()})
 
 
@@ -108,7 +115,7 @@ NAMES = tuple(f.name for f in fields(Limits) if f.default is not MISSING)
 
 
 def parse_limits(texts: Sequence[str]) -> dict[str, str]:
-    """ "NAME=VALUE" each, as the command line has them. Raises LimitError."""
+    """Values by name from "NAME=VALUE" texts of the command line. Raises LimitError."""
     for text in texts:
         if "=" not in text:
             raise LimitError(f"--limit {text}: write NAME=VALUE or NAME=off; there are: {', '.join(NAMES)}")
@@ -130,7 +137,7 @@ def _value(name: str, value: Any, where: str) -> float:
 
 
 def limits_of(model: Any, contract: Contract) -> Limits:
-    """Ranges and torques of the export's scene, compiled; what it does not limit is without limit."""
+    """Ranges and torques from the compiled scene of an export. A missing range or torque limit becomes "off"."""
     joints = [model.joint(name).id for name in contract.joints]
     servos = [model.actuator(name).id for name in contract.joints]
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
@@ -140,7 +147,7 @@ def limits_of(model: Any, contract: Contract) -> Limits:
 
 
 class _Seen(NamedTuple):
-    """What one measurement says of motion, and what the servos were told before it; of several, (N, ...) each."""
+    """The motion in one measurement, and the servos' target before it. Several measurements: (N, ...) each."""
 
     joint_pos: Floats
     joint_vel: Floats
@@ -150,7 +157,7 @@ class _Seen(NamedTuple):
 
 
 class Safety:
-    """Checks one robot. Its memory is of the last steps only; ``reset`` forgets it when a person starts the robot again."""
+    """Checks one robot. It remembers the last steps only."""
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
         if contract.action.origin == "speed":
@@ -161,20 +168,20 @@ class Safety:
         self.reset()
 
     def reset(self) -> None:
-        """As if nothing had been measured, asked or missed."""
-        self._last: Floats | None = None  # targets (D,) of the step before
-        self._held: Floats | None = None  # what the servos were told then
+        """Forget all steps, when a person starts the robot again."""
+        self._last: Floats | None = None  # (D,) targets of the step before, as the policy gave them
+        self._held: Floats | None = None  # (D,) the same, clipped as the servos got them
         self._seen = deque[_Seen](
             maxlen=max(1, math.ceil(_ALONE * self.limits.frozen)) if self.limits.frozen < OFF else 1
         )
-        self._same = dict.fromkeys(_Seen._fields[:4], 0)  # measurements in a row in which a part is the same
-        self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) the same of one angle
-        self._lived = set[str]()  # parts but joint_pos that changed: what is not measured never does
-        self._late: deque[float] = deque()  # [s] of steps that began late, within the last second
-        self._remote: float | None = None  # [s] when the remote was last there
+        self._same = dict.fromkeys(_Seen._fields[:4], 0)  # sensor -> identical values in a row
+        self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) identical angles in a row
+        self._lived = set[str]()  # sensors except joint_pos that changed at least once; a missing sensor never does
+        self._late: deque[float] = deque()  # [s] times of late steps within the last second
+        self._remote: float | None = None  # [s] when the remote was last received
 
     def sensed(self, measured: Measurement, health: Health, now: float, behind: float = 0.0) -> Trip | None:
-        """The first limit that a measurement passes; ``now`` [s], ``behind`` [s] is how late the step began."""
+        """The first limit that a measurement passes. ``now`` [s]; ``behind`` [s]: how late the step began."""
         return (
             self._finite(measured)
             or self._fresh(measured, health)
@@ -186,13 +193,16 @@ class Safety:
         )
 
     def held(self, targets: Floats) -> Floats:
-        """``targets`` (D,) within the servos' range; torques within that of the motors, if their actuators have one."""
+        """Clip ``targets`` (D,) to the servos' range; torques to the motors' range, if their actuators have one."""
         return np.clip(targets, self.limits.lowest, self.limits.highest)
 
     def asked(
         self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None
     ) -> Trip | None:
-        """The first limit that targets (D,) [rad], or torques [N m], pass, for servos with these gains (D,); None: the contract's."""
+        """The first limit that targets (D,) [rad], or torques [N m], pass.
+
+        ``stiffness`` and ``damping`` (D,) of the servos; None: the contract's.
+        """
         limits, contract = self.limits, self.contract
         strong = "is asked for {value:.1f} N m, more than {most:.1f}"
         if not (finite := np.isfinite(targets)).all():
@@ -241,10 +251,10 @@ class Safety:
         return self._alive(measured)
 
     def _alive(self, measured: Measurement) -> Trip | None:
-        """Whether the measurement stands still, or one part of it while others say that it cannot."""
+        """Trip if the measurement is frozen, or one sensor is frozen while others show motion."""
         still = measured.joint_pos if self._held is None else self._held
         parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, still
-        seen = _Seen(*map(np.array, parts))  # copies: a robot may measure into the same arrays
+        seen = _Seen(*map(np.array, parts))  # copies: a robot may reuse its arrays
         before = self._seen[-1] if self._seen else seen
         self._seen.append(seen)
         self._stuck = np.where(seen.joint_pos == before.joint_pos, self._stuck + 1, 1)
@@ -262,14 +272,14 @@ class Safety:
         return self._contradicted(frozen, stuck) if frozen or stuck.any() else None
 
     def _contradicted(self, frozen: list[str], stuck: Any) -> Trip | None:
-        """The first of the parts that are ``frozen`` and the joints that are ``stuck`` (D,) of which others say that it must move."""
+        """Trip on the first frozen sensor, or ``stuck`` joint (D,), that must have moved by what other sensors show."""
         seen = _Seen(*map(np.array, zip(*self._seen, strict=True)))
         count, period = len(seen.joint_pos), self.contract.period
-        told = np.ptp(seen.target[: count - count // 3], axis=0)  # what is told just now needs time to move a joint
+        told = np.ptp(seen.target[: count - count // 3], axis=0)  # a joint needs time to follow the newest targets
         went = np.ptp(period * np.cumsum(seen.joint_vel, axis=0), axis=0)
         moved, leant = float(np.ptp(seen.joint_pos, axis=0).max()), float(np.ptp(seen.gravity, axis=0).max())
         turned = float(np.ptp(period * np.cumsum(np.cross(seen.ang_vel, seen.gravity), axis=0), axis=0).max())
-        # A body that is carried or pushed may keep its joints' angles.
+        # The joints of a body that is carried or pushed may stay still.
         drives = told.max() > _ASKED or (told.max() > _MOVED and max(leant, turned) > _MOVED)
         moves = {
             "joint_pos": drives or went.max() > _MOVED,
@@ -351,5 +361,5 @@ class Safety:
 
 
 def _first(wrong: Any) -> int:
-    """The first joint that is wrong."""
+    """Index of the first wrong joint."""
     return int(np.argmax(wrong))

@@ -1,6 +1,6 @@
-"""What of a contract the network was trained with: its checksum, and what was changed since, beside what was exported.
+"""The checksum of a contract over all values that belong to the training, and the list of values changed since.
 
-The contract carries a copy of what was exported, since nothing else in an export has all of it.
+The contract carries a copy of those values as exported, since no other file of an export has all of them.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import Any
 
 from legged_mw.utils.errors import brief
 
-CHECKSUM = "checksum"  # of what the network's numbers mean, which may not change without the network
-EXPORTED = "exported"  # the same as it was exported: base64 of zlib of JSON
-FREE = ("task", "ends", "exam", "safety")  # what may change: how the policy is judged and watched
-_MOST_TEXT = 1 << 22  # bytes that `exported` may unpack to; a G1's has a four-hundredth
+CHECKSUM = "checksum"  # of the values that must not change without the network
+EXPORTED = "exported"  # those values at the export: base64 of zlib of JSON
+FREE = ("task", "ends", "exam", "safety")  # sections that may change: how the policy is graded and supervised
+_MOST_TEXT = 1 << 22  # [byte] limit of the unpacked `exported`; a G1's has a four-hundredth
 
 
 def checksum(said: Mapping[str, Any]) -> str:
-    """SHA-256 of all in a contract that the network was trained with: joints, rows, scales and the rest, in their order."""
+    """SHA-256 of the contract's values that belong to the training: joints, rows, scales and so on, in their order."""
     return hashlib.sha256(_bound(said).encode()).hexdigest()
 
 
 def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
-    """A contract with both lines."""
+    """The contract with both lines, `checksum` and `exported`."""
     text = _bound({**said, EXPORTED: ""}).encode()
     return {
         **said,
@@ -36,7 +36,7 @@ def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def changes(said: Mapping[str, Any]) -> list[str]:
-    """A line for each value that is not as it was exported, beside the exported one."""
+    """A line for each value that differs from the exported one, with both values."""
     if EXPORTED not in said and said.get(CHECKSUM) == checksum(said):  # formats before 5 have no copy
         return []
     try:
@@ -52,13 +52,13 @@ def changes(said: Mapping[str, Any]) -> list[str]:
 
 
 def _bound(said: Mapping[str, Any]) -> str:
-    # formats before 5 have no copy, and left it free
+    # formats before 5 have no copy, and `format` was not part of the checksum
     free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in said else ["format"]))
     return json.dumps({name: value for name, value in said.items() if name not in free}, default=str, skipkeys=True)
 
 
 def _values(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Each value in mappings and lists, and where it stands: observation[3].scale."""
+    """Each value in nested mappings and lists, with its place, e.g. observation[3].scale."""
     if isinstance(tree, dict) and tree:
         for name, value in tree.items():
             yield from _values(value, f"{place}.{name}" if place else str(name))

@@ -1,8 +1,9 @@
-"""Robots in MuJoCo's C engine, from an export's ``scene.xml``: its names, checked; one robot behind the seam, or many side by side.
+"""Simulated robots in MuJoCo's C engine, from an export's ``scene.xml``: one ``Robot``, or many side by side.
 
-Measurements come from MuJoCo's sensors by their names. A physics step computes sensors before it moves the robot, so after each
-period the sensors of position, velocity and contact are computed again, in the new state. What needs forces (torque,
-acceleration) is one physics step old, as it was in training. Contact was one step old in training, too.
+MuJoCo's sensors give the measurements, by name. A physics step computes sensors before it moves the robot. After each
+period the sensors of position, velocity and contact are therefore computed again, in the new state.
+Torque and acceleration need forces, so they are one physics step old, as in training.
+In training, contact was one step old, too.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -45,9 +46,13 @@ from legged_mw.utils.machine import require_memory, usable_cores
 
 
 def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity: Floats, heading: float = 0.0) -> None:
-    """Put the robot over its place (x, y) in ``data``: ``angles`` (D,) [rad] of ``joints``, ``gravity`` (3,) in the body, heading [rad]."""
+    """Put the robot into a pose at its (x, y) in ``data``, on the ground.
+
+    ``angles`` (D,) [rad] of ``joints``, ``gravity`` (3,) in the body frame, heading [rad].
+    """
     data.qpos[[model.joint(name).qposadr[0] for name in joints]] = angles
-    up, tilt, turn = -gravity / np.linalg.norm(gravity), np.zeros(4), np.zeros(4)  # z axis of the world, in the body
+    # the world's z axis in the body frame
+    up, tilt, turn = -gravity / np.linalg.norm(gravity), np.zeros(4), np.zeros(4)
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])  # level, or upside down
@@ -61,7 +66,7 @@ def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity:
 
 
 def _reach(model: Any, geom: int, turn: Floats) -> float:
-    """How far a sphere or capsule reaches down from its centre [m]; of another shape the box around it."""
+    """Distance [m] from the centre to the lowest point: exact for a sphere or capsule, else that of its box."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         return size[0] + abs(turn[8]) * size[1]
@@ -71,16 +76,16 @@ def _reach(model: Any, geom: int, turn: Floats) -> float:
 
 
 Change = Callable[[mujoco.MjModel], None]
-_NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
+_NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # recompute the sensors of position and velocity in the new state
 
-_GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees: a robot's own are others
+_GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees; the robot's own are in other groups
 _SHAPES = 3  # geom group of a robot's collision shapes
-_DEEP, _FAR = 0.1, 1e4  # [m] of a start under the ground, and away from the middle of the world, that is none
-_ABOVE = 2.0  # [m] over the root, where its rays begin
+_DEEP, _FAR = 0.1, 1e4  # [m] limits of a start pose: depth under the ground, distance from the origin
+_ABOVE = 2.0  # [m] above the root, where the scan's rays begin
 
 
 class Fleet:
-    """``count`` robots, each in a world of its own, stepped together on ``threads`` threads (0: one a core)."""
+    """``count`` robots, each in its own world, stepped on ``threads`` threads (0: one per core)."""
 
     def __init__(
         self,
@@ -92,9 +97,10 @@ class Fleet:
         whole: bool = False,
         change: Change | None = None,
     ) -> None:
-        """Load the scene and put every robot into its first keyframe. ``whole``: its body touches the ground too, not only its feet.
+        """Load the scene and put every robot into its first keyframe.
 
-        ``change`` is made to the model before it is stepped. Raises ContractError.
+        ``whole``: the whole body can touch the ground, not only the feet.
+        ``change`` edits the model before the first step. Raises ContractError.
         """
         scene = read_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
@@ -103,30 +109,31 @@ class Fleet:
         # a broken world counts as fallen; nothing is printed
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _keep_quiet()
-        # as sim/engines.py
+        # the same check as in sim/engines.py
         require_memory(0.2 * mujoco.MjData(self.model).nbuffer * count, "cpu", f"--num_envs {count}", "take fewer")
         self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
         # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
         self.qpos: Floats = self._batch.bind("qpos")
-        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written
+        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written here
         self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
         self._where, self._contacts = scene.sensordata, scene.contacts
-        # robots that MuJoCo could not step since their reset
+        # (N,) MuJoCo could not step the robot, since its reset
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
-        self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]  # of each joint in qpos
+        # index of each joint in qpos
+        self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]
         self.reset()
 
     def read(self) -> Measurement:
-        """Measurement of every robot, (N, ...) each, in copies."""
+        """Measurement of every robot, (N, ...) each, copied."""
         values = {name: self._value(name) for name in self._layout}
         return Measurement(
             **{n: values[n] for n in QUANTITIES}, others={n: v for n, v in values.items() if n not in QUANTITIES}
         )
 
     def write(self, targets: Floats) -> None:
-        """Step every robot by one period with servo targets (N, D) [rad], or torques where an action is one."""
+        """Step every robot by one period with servo targets (N, D) [rad], or torques [N m]."""
         self._ctrl[:, self._actuators] = targets
         if not self._network:
             self._step(self.contract.decimation, _NOW)
@@ -140,11 +147,11 @@ class Fleet:
     def _step(self, count: int, stage: int) -> None:
         try:
             self._batch.step(nstep=count, stage=stage)
-        except SimulationError as error:  # the others are stepped all the same
+        except SimulationError as error:  # the other worlds are stepped all the same
             self.broken[error.ids] = True
 
     def fell(self) -> NDArray[np.bool_]:
-        """Robots (N,) that fell by the contract's `ends`, or whose state is not finite."""
+        """Robots (N,) that fell by the contract's `ends`, or with a state that is not finite."""
         ends = self.contract.ends
         fell = ends.tilted(self._value("gravity")) | ~np.isfinite(self.qvel).all(axis=1) | self.broken
         if ends.min_base_height is not None:
@@ -152,12 +159,12 @@ class Fleet:
         return fell | (self._sensors[:, self._where[FALL]] > 0.0).any(axis=1) if ends.falls_on else fell
 
     def touching(self) -> NDArray[np.bool_]:
-        """Which geoms of the feet touch the ground (N, G), in the order of their sensors."""
+        """Foot geoms on the ground (N, G), in the order of their sensors."""
         where = sorted({int(place) for places in self._contacts for place in places})
         return self._sensors[:, where] > 0.0
 
     def refresh(self) -> None:
-        """Compute the sensors of position, velocity and contact after a change of ``qpos`` or ``qvel``."""
+        """Recompute the sensors of position, velocity and contact after a change of ``qpos`` or ``qvel``."""
         self._batch.forward(stage=_NOW)
 
     def reset(self, which: Any = None) -> None:
@@ -169,10 +176,11 @@ class Fleet:
             self._network.reset(which)
 
     def set_gains(self, stiffness: Floats, damping: Floats) -> None:
-        """Servos of every robot from now on: (D,) [N m/rad], (D,) [N m s/rad], in the contract's order.
+        """Set the servo gains of every robot: (D,) [N m/rad] and (D,) [N m s/rad], in the contract's order.
 
-        Damping is held to what these physics steps can take, half of inertia / timestep; drives run faster. Motors that are no servos
-        are on at their own gains, or, without stiffness, off.
+        Damping is clipped to half of inertia / timestep, the most that these physics steps can integrate.
+        Real drives run faster.
+        Motors that are not servos keep the scene's gains; without stiffness they are off.
         """
         scene, dofs, motors = self.model.dof_damping[self._dofs].ravel(), self._dofs, self.contract.motors
         stable = np.maximum(scene, 0.5 / (self.model.dof_invweight0[dofs] * self.contract.timestep))
@@ -200,7 +208,7 @@ class Fleet:
         return self._sensors[:, self._where[name]]
 
     def _gravity(self) -> Floats:
-        """Direction of gravity (N, 3), body frame; it may lean towards the world's x axis."""
+        """Gravity's direction (N, 3), body frame. On a slope it leans towards the world's x axis."""
         up, (x, _, z) = (
             self._sensors[:, self._where["up"]],
             self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity),
@@ -213,16 +221,16 @@ class Fleet:
         )
 
     def _scan(self) -> Floats:
-        """The height scan (N, points) [m] of the contract."""
+        """The contract's height scan (N, points) [m]."""
         assert self.contract.scan
         xs, ys, standing = self.contract.scan
         px, py = (grid.ravel() for grid in np.meshgrid(xs, ys, indexing="ij"))
         return np.clip(self._heights(px, py) - standing, -1.0, 1.0)
 
     def _heights(self, px: ArrayLike, py: ArrayLike) -> Floats:
-        """Height (N, points) [m] of each root above the ground at points ahead of it and to its left; inf where there is no ground.
+        """Height (N, points) [m] of each root above the ground at points ahead and to the left; inf without ground.
 
-        Rays from above find the ground: they see geom group 0 alone.
+        Rays from above find the ground: they see geom group 0 only.
         """
         px, py, root, (w, x, y, z) = np.asarray(px), np.asarray(py), self.qpos[:, :3], self.qpos[:, 3:7].T
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))[:, None]
@@ -235,7 +243,7 @@ class Fleet:
 
 
 class MujocoRobot(Robot):
-    """One simulated robot behind the seam. Simulated time moves on in ``write``, ``damp`` and ``limp``, by one period."""
+    """One simulated robot. ``write``, ``damp`` and ``limp`` advance the simulation by one period."""
 
     def __init__(
         self,
@@ -247,9 +255,9 @@ class MujocoRobot(Robot):
         hoisted: bool = False,
         lift: float = 0.0,
     ) -> None:
-        """``whole``: its body touches the ground too. ``hoisted``: its base hangs until targets come at its own gains.
+        """Load the robot. ``whole``: its whole body can touch the ground.
 
-        It hangs ``lift`` [m] above its start.
+        ``hoisted``: the base hangs ``lift`` [m] above its start until ``write`` is called without gains.
         """
         self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
@@ -274,7 +282,7 @@ class MujocoRobot(Robot):
         self._move(self._targets, 0.0 * self._gains[0], 0.0 * self._gains[1])
 
     def close(self) -> None:
-        """From now on its joints are damped, whatever is written."""
+        """Damp the joints from now on, even after a later ``write``."""
         self._set(0.0 * self._gains[0], damped(self.fleet.contract))
         self._closed = True
 
@@ -282,7 +290,7 @@ class MujocoRobot(Robot):
         return bool(self.fleet.fell()[0])
 
     def _move(self, targets: Floats, stiffness: Floats, damping: Floats) -> None:
-        """One period."""
+        """Advance by one period."""
         if not self._closed:
             self._set(stiffness, damping)
         self._targets = targets
@@ -292,14 +300,14 @@ class MujocoRobot(Robot):
             self.fleet.refresh()
 
     def _set(self, *gains: Floats) -> None:
-        """Nothing is touched while the gains stay those of the scene."""
+        """Set gains only if they changed."""
         if any((new != old).any() for new, old in zip(gains, self._gains, strict=True)):
             self.fleet.set_gains(*gains)
             self._gains = gains
 
 
 def _keep_quiet() -> None:
-    """A world that breaks is counted; MuJoCo would print a line and write a file of its own."""
+    """Stop MuJoCo from printing and from writing a log file. A broken world is counted instead."""
     config = mujoco.MjLogConfig.get()
     config.logto_console = config.logto_file = False
     config.set()
@@ -310,21 +318,22 @@ def _keep_quiet() -> None:
 
 @dataclass(frozen=True)
 class DeployScene:
-    """The robot in MuJoCo, and where its names are."""
+    """The robot in MuJoCo, and the indices of its names."""
 
     spec: mujoco.MjSpec
-    model: mujoco.MjModel  # compiled from it
+    model: mujoco.MjModel  # compiled from `spec`
     actuators: np.ndarray  # (D,) index of each joint's servo in ctrl
     dofs: np.ndarray  # (D,) index of each joint in qvel
-    sensordata: dict[str, np.ndarray]  # quantity, or name of a row with sensors of its own -> indices in sensordata
-    contacts: list[np.ndarray]  # the same of each foot
+    sensordata: dict[str, np.ndarray]  # quantity, or name of a row with its own sensors -> indices in sensordata
+    contacts: list[np.ndarray]  # per foot: indices of its contact sensors in sensordata
 
 
 def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> DeployScene:
-    """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError.
+    """Load ``file`` of an export and check that it is the contract's robot. Raises ContractError.
 
-    ``whole``: every body with collision shapes (group 3) touches the ground, and the solver is one for a robot that lies there.
-    Training leaves most bodies out and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
+    ``whole``: every body with collision shapes (group 3) can touch the ground, and the solver has MuJoCo's own
+    iterations, for a lying robot. Training leaves most bodies out and stops after the first iterations. Bodies with
+    contacts, such as feet, stay unchanged.
     """
     if file == TERRAIN_FILE and not ((folder / file).is_file() and (contract.terrain or not contract.scene)):
         raise ContractError(
@@ -367,8 +376,9 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
 
 
 def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Raises ValueError where the first keyframe is no place to start from."""
-    if not spec.keys or not len(spec.keys[0].qpos):  # the model has one by `size nkey` alone, with straight legs
+    """Raise ValueError if the first keyframe is no place to start from."""
+    # otherwise the model's keyframe, from `size nkey`, has straight legs
+    if not spec.keys or not len(spec.keys[0].qpos):
         raise ValueError("it has no keyframe; the first one says where the robot starts")
     if not np.any(model.opt.gravity):
         raise ValueError("it has no gravity, so no direction is down")
@@ -412,7 +422,7 @@ def _places(model: mujoco.MjModel, file: str, sensors: Sequence[str], what: str)
 
 
 def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
-    """The sensors of the joints measure them in the contract's order."""
+    """Check that the joint sensors are in the contract's order."""
     for name, sensors in ((name, contract.sensors[name]) for name in ("joint_pos", "joint_vel")):
         for joint, sensor in zip(contract.joints, sensors, strict=True):
             if (found := model.joint(int(model.sensor(sensor).objid[0])).name) != joint:
@@ -425,7 +435,7 @@ def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
 def _check_machine(
     model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]
 ) -> None:
-    """Joints, gains, ranges, mass and step are those that the contract names."""
+    """Check joints, gains, ranges, mass and time step against the contract."""
     if model.nq != 7 + len(joints) or model.nu != len(joints):
         have = [name for name in _names(model, "joint") if name not in contract.joints]
         raise ContractError(

@@ -1,4 +1,4 @@
-"""An export's robots as a stage: something to be watched and driven, one control step at a time."""
+"""An export's robots as a stage: a viewer can show and drive them, one control step at a time."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Change, Fleet
 
-STROLL = {"lin_vel_x": 0.5}  # [m/s] where no command is given: a robot that walks shows more than one that stands
+STROLL = {"lin_vel_x": 0.5}  # [m/s] without a command: a walking robot shows more than a standing one
 
 
 def idle_command(contract: Contract) -> Floats:
-    """(C,) what a robot follows that gets no command: a stroll where it is trained to walk, else the defaults."""
+    """The command (C,) of a robot without a user: a stroll if it is trained to walk, else the defaults."""
     return contract.held([STROLL.get(command.name, command.default) for command in contract.commands])
 
 
 class DeployStage:
-    """``num_worlds`` robots that follow an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
+    """``num_worlds`` robots with an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
 
     def __init__(
         self,
@@ -42,9 +42,9 @@ class DeployStage:
     ) -> None:
         """Load the export in ``folder``.
 
-        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's;
-        ``change`` is made to the model first. ``whole``: see Fleet. ``edited``: see read_contract.
-        ``contact``: the policy sees the velocity of leg odometry, which finds feet on the ground so; None: the true one.
+        ``command`` (C,) applies when ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
+        ``change`` edits the model before the first step. ``whole``: see Fleet. ``edited``: see read_contract.
+        ``contact``: the policy sees the velocity of leg odometry with this contact detection; None: the true velocity.
         """
         contract = read_contract(folder, edited)
         self.contract = replace(contract, ends=ends or contract.ends)
@@ -57,10 +57,10 @@ class DeployStage:
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()
         self._fell = np.zeros(num_worlds, dtype=bool)
-        self.measured = self._seen = self.fleet.read()  # at the end of the last step; as the policy saw it
+        self.measured = self._seen = self.fleet.read()  # after the last step; as the policy saw it
 
     def step(self, commands: Floats | None = None) -> None:
-        """One period with ``commands`` (N, C), or the stage's own. A robot that falls starts again."""
+        """Run one period with ``commands`` (N, C), or the default ones. A robot that falls starts again."""
         self._commands = (
             self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
         )
@@ -73,51 +73,51 @@ class DeployStage:
         self.measured = self.fleet.read()
 
     def commands(self) -> Floats:
-        """(N, C) of the last step, in the order of ``command_table``."""
+        """Commands (N, C) of the last step, in the order of ``command_table``."""
         return self._commands.copy()
 
     def velocity(self) -> Floats:
-        """(N, 3) vx, vy [m/s] of the IMU, yaw rate [rad/s], body frame."""
+        """(N, 3) vx, vy [m/s] of the IMU and yaw rate [rad/s], body frame."""
         return np.concatenate([self.measured.lin_vel[:, :2], self.measured.ang_vel[:, 2:]], axis=1)
 
     def believed_velocity(self) -> Floats | None:
-        """(N, 2) vx, vy [m/s] that the policy believed when it acted last, or leg odometry; None if nothing estimates them."""
+        """(N, 2) vx, vy [m/s] from leg odometry, else from the policy at its last step; None without an estimate."""
         estimate = self._seen.lin_vel if self.odometry else self.controller.estimate("base_lin_vel")
         return None if estimate is None else estimate[:, :2]
 
     def qpos(self) -> Floats:
-        """(N, nq)."""
+        """Positions (N, nq)."""
         return self.fleet.qpos.copy()
 
     def ghost(self) -> Floats | None:
-        """(N, nq) what each robot follows."""
+        """The frame (N, nq) that each robot follows, if it follows a motion."""
         return self.controller.follower.ghost() if self.controller.follower else None
 
     def contacts(self) -> NDArray[np.bool_]:
-        """(N, G), the geoms of the feet."""
+        """(N, G) True for a foot geom on the ground."""
         return self.fleet.touching()
 
     def fell(self) -> NDArray[np.bool_]:
-        """(N,) in the last step."""
+        """(N,) True for a fall in the last step."""
         return self._fell.copy()
 
     def ground(self, world: int) -> str:
-        """Empty: a scene has no names for its ground."""
+        """Always empty: a scene has no names for its ground."""
         return ""
 
     def push(self, world: int, velocity: Any) -> None:
-        """Add ``velocity`` (2,) [m/s, world frame] to the robot's horizontal velocity; the policy sees it a step later."""
+        """Add ``velocity`` (2,) [m/s, world frame] to the base velocity. The policy sees it a step later."""
         self.fleet.qvel[world, :2] += velocity
 
     def put(self, qpos: Floats, qvel: Floats) -> None:
-        """All robots begin anew in these states, (N, nq) and (N, nv)."""
+        """Put all robots into these states, (N, nq) and (N, nv), and start them again."""
         self.fleet.qpos[:], self.fleet.qvel[:] = qpos, qvel
         self.fleet.refresh()
         self._forget(slice(None))
         self.measured = self.fleet.read()
 
     def reset(self, world: int) -> None:
-        """Back to the start, at rest."""
+        """Put the robot back to the start, at rest."""
         self.fleet.reset([world])
         self._forget([world])
         self.measured = self.fleet.read()

@@ -1,6 +1,9 @@
-"""What a robot does: zero torque -> (start) -> stand -> (A) -> policy -> (select, a fall, a trip) -> damping -> (start) -> the first.
+"""The states of a robot, and the buttons between them.
 
-A person moves it on, by a remote, a gamepad or keys; only damping comes by itself. Times are handed in: nothing waits here.
+zero torque -> (start) -> stand -> (A) -> policy -> (select, a fall, a trip) -> damping -> (start) -> zero torque.
+
+A person changes the state by a remote, a gamepad or keys; only damping can begin by itself.
+The caller passes times in: nothing waits here.
 """
 
 from __future__ import annotations
@@ -19,38 +22,40 @@ from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
 
 ZERO, STAND, POLICY, DAMPING, CHECK = STATES = ("zero torque", "stand", "policy", "damping", "joint check")
-ARMED = (STAND, POLICY, CHECK)  # states in which limits are watched: in the others nothing pushes
-RISE = 2.0  # [s] from wherever the joints are to the default pose [unitree_rl_gym]
-SOFT = 0.1  # [share of the stiffness] that standing up begins with
-NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
-# [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times what go2_flat walks with
+ARMED = (STAND, POLICY, CHECK)  # states with limits; in the others no motor pushes
+RISE = 2.0  # [s] of standing up, from any pose to the default pose [unitree_rl_gym]
+SOFT = 0.1  # [share of the stiffness] at the start of standing up
+NEAR = 0.15  # [rad] ours: a joint farther from the pose after RISE carries weight and gets stiffer
+# [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times the gain of go2_flat
 STIFFEST = 3.0
-STIFFEN = 1.0  # [share of the stiffness a second]
-# Ours, of an IMU while the robot stands up: shipped Go1 and Go2 tilt by 0.1 rad in all; gyro and legs miss 0.05 of it, wrong axes 0.7
-TILTS, MISSED = 0.03, 0.6  # [rad] of tilt from which gyro and legs are judged; share of it that they may miss
-TURN = 5  # measurements whose mean is compared: they have noise, and their times are not exact
-# [rad] by which a robot with three feet or more rolls to each side as it stands up; by which a joint may, for that
+STIFFEN = 1.0  # [share of the stiffness per second]
+# IMU check while the robot stands up. Ours: the shipped Go1 and Go2 tilt by 0.1 rad in all. With right axes gyro and
+# legs differ from gravity by 0.05 of the tilt, with wrong axes by 0.7.
+TILTS, MISSED = 0.03, 0.6  # [rad] least tilt for a check; share of it that may differ
+TURN = 5  # measurements per mean: single ones are noisy, and their times are not exact
+# [rad] roll to each side while standing up, with three feet or more; largest joint motion for it
 SWAY, BEND = 0.06, 0.15
-# [deg] between gravity and what the legs say of it: the steepest ground to start on, with what encoders are off
+# [deg] between gravity and the legs' estimate of it: the steepest ground to start on, encoder offsets included
 STEEP = 25.0
-PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and what the accelerometer feels; [m/s^2] of a robot at rest
-STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: the shipped policies walk off from there
+PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and accelerometer; [m/s^2] range for a robot at rest
+STANDS = 0.3  # [rad] from the pose, at most, to start a policy; ours: the shipped policies walk off from there
 
 
 _IMU = ("ang_vel", "gravity", "acceleration")
-KEPT = 125  # measurements that are kept while the robot stands up: 2.5 s, as the bias of a gyro adds up
+KEPT = 125  # measurements kept while standing up: 2.5 s, since a gyro's bias adds up
 
 
 def _in_turns(values: Floats) -> Floats:
-    """Means (N // TURN, 3) of TURN values (N, 3) each: less noise, and times that are not exact count less."""
+    """Means (N // TURN, 3) over TURN rows of ``values`` (N, 3): less noise, and inexact times matter less."""
     return values[: len(values) // TURN * TURN].reshape(-1, TURN, 3).mean(axis=1)
 
 
 def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
-    """What is wrong with the axes of an IMU that was carried so, one measurement a period; "" if nothing is, or too little moved to tell.
+    """What is wrong with the IMU's axes, from one measurement a period; "" if nothing, or if too little moved.
 
-    Gravity turns as the gyro says, and at rest is what the accelerometer feels. An IMU whose parts are all turned in the same way, or
-    read in the same wrong order about an axis along which nothing tilts, is right by both: ``at_odds`` finds it.
+    Gravity must turn as the gyro says, and at rest point against the accelerometer. Two faults pass both
+    checks: all sensors of the IMU are turned in the same way, or all swap the same axes and nothing tilts along the
+    third. ``at_odds`` finds those.
     """
     if len(seen) <= TURN:
         return ""
@@ -68,9 +73,11 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
 
 
 def at_odds(legs: Floats, gravity: Floats) -> str:
-    """Where measured ``gravity`` (N, 3), one a period, is not what the ``legs`` (N, 3) say of it; "" if nowhere, or too little is known.
+    """Compare measured ``gravity`` (N, 3), one a period, with the estimate of the ``legs`` (N, 3).
 
-    A slope is between them all the time, so pitch and roll must change alike, and be no farther apart than a slope may be steep.
+    Returns the difference in words; "" if they agree, or if too little is known.
+    A slope shifts the two by a constant. Pitch and roll must therefore change alike, and the shift must not exceed the
+    steepest slope.
     """
     known = np.isfinite(legs).all(axis=1)
     if known.sum() < TURN:
@@ -87,23 +94,24 @@ def at_odds(legs: Floats, gravity: Floats) -> str:
 
 
 class Order(NamedTuple):
-    """What the servos do in the next period."""
+    """The command to the servos for the next period."""
 
     state: str
-    # (D,) [rad] as asked for, which limits judge and hold; None: limp in ZERO, damped in DAMPING
+    # (D,) [rad] before clipping, for the limits to check; None: limp in ZERO, damped in DAMPING
     targets: Floats | None = None
     stiffness: Floats | None = None  # (D,); None: the contract's
     damping: Floats | None = None  # (D,); None: the contract's
 
 
 class States:
-    """The states of one robot, and who may change them.
+    """The states of one robot. Input sources, limits and falls change them.
 
-    ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
+    ``command`` returns (C,) at a time [s] since the policy began; it applies while no source drives.
+    ``say`` gets a line for each change.
     """
 
-    first = STAND  # what start begins
-    over, report, right = False, "", True  # whether the run ends now; what is said at its end, and whether that is good
+    first = STAND  # the state that the start button begins
+    over, report, right = False, "", True  # true if the run ends now; text at its end, and whether that is good
 
     def __init__(
         self,
@@ -113,14 +121,14 @@ class States:
         say: Callable[[str], None] = print,
     ) -> None:
         self.controller, self.sources, self._own, self._say = controller, list(sources), command, say
-        self.state, self.since = ZERO, 0.0  # [s] since when
-        self.command = controller.contract.held(command(0.0))  # (C,) as followed now
+        self.state, self.since = ZERO, 0.0  # [s] begin of the state
+        self.command = controller.contract.held(command(0.0))  # (C,) command in use
         self.note = f"{START}: {self.first}"
-        self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
+        self._from: Floats = controller.contract.default_pose  # (D,) [rad] pose at the start of standing up
         self._stiffer = 1.0
-        # since standing up began; what the legs said of gravity then
+        # measurements since standing up began; the legs' estimate of gravity in each
         self._rise, self._down = list[Measurement](), list[Floats]()
-        self._legs, self._sway = None, np.zeros(len(self._from))  # (D,) [rad] of the sway at its end
+        self._legs, self._sway = None, np.zeros(len(self._from))  # (D,) [rad] amplitude of the sway
         if len(controller.contract.feet) > 2:
             self._legs = Odometry(controller.folder, controller.contract)
             leaning = self._legs.leaning(self._from, np.array([1.0, 0.0, 0.0]))
@@ -129,11 +137,11 @@ class States:
 
     @property
     def armed(self) -> bool:
-        """Whether limits are watched."""
+        """True in the states with limits."""
         return self.state in ARMED
 
     def listen(self, health: Health, now: float) -> Trip | None:
-        """Ask everyone who may drive; an emergency stop comes back."""
+        """Poll all input sources. Returns a trip for an emergency stop."""
         wishes = [source.poll(health) for source in self.sources]
         driving = next((i for i, wish in enumerate(wishes) if wish.command is not None), None)
         if driving is None:
@@ -148,7 +156,7 @@ class States:
         return Trip("stop", stop) if stop and self.state != DAMPING else None
 
     def step(self, measured: Measurement, now: float) -> Order:
-        """Move on as was wished, and say what the servos do."""
+        """Change the state by the pressed buttons; returns the servos' order."""
         self._move_on(measured, now)
         if self.state == STAND:
             return self._stand(measured, now)
@@ -158,13 +166,13 @@ class States:
         return Order(self.state)
 
     def trip(self, trip: Trip, now: float) -> Order:
-        """A limit was passed: damping, until a person starts again."""
+        """A limit was passed: damp until a person starts the robot again."""
         if self.state != DAMPING:
             self._enter(DAMPING, now, trip.text)
         return Order(DAMPING)
 
     def close(self) -> None:
-        """Give back keys and files."""
+        """Release keys and files."""
         for source in self.sources:
             source.close()
 
@@ -184,7 +192,7 @@ class States:
             self._begin(measured, now)
 
     def _begin(self, measured: Measurement, now: float) -> None:
-        """The policy, if the robot stands."""
+        """Start the policy if the robot stands."""
         contract = self.controller.contract
         off = np.abs(measured.joint_pos - contract.default_pose)
         if now - self.since < RISE or contract.ends.tilted(measured.gravity) or off.max() > STANDS:
@@ -203,9 +211,9 @@ class States:
         self._enter(POLICY, now, f"{END}: damping")
 
     def _stand(self, measured: Measurement, now: float) -> Order:
-        """A straight line to the default pose with gains that rise; where that does not carry the robot, they rise further.
+        """Go straight to the default pose with rising gains. If a joint lags behind, all gains rise further.
 
-        In the second half of it a robot with three feet or more sways to both sides, so that its IMU is seen to roll.
+        In the second half a robot with three feet or more sways to both sides, so that its IMU is seen to roll.
         """
         contract = self.controller.contract
         if len(self._rise) < KEPT:

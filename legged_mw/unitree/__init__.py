@@ -1,6 +1,6 @@
-"""Unitree's robots behind the seam ``Robot``, over their low-level DDS interface, and a simulated one at the other end of the wire.
+"""Unitree's robots over their low-level DDS interface, each as a ``Robot``, and a simulated robot on the same wire.
 
-cyclonedds is imported in ``idl`` and ``link`` alone, and these two only where the wire is used.
+Only ``idl`` and ``link`` import cyclonedds. Import these two only where the wire is used.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ INSTALL = "pip install 'legged_mw[unitree]'"
 
 
 def need_dds() -> None:
-    """Raise UserError with the command that installs what is missing."""
+    """Raise UserError with the install command if cyclonedds is missing."""
     if find_spec("cyclonedds") is None:
         raise UserError(f"Unitree's robots speak DDS, which needs cyclonedds: {INSTALL}")
 
 
 def clock() -> float:
-    """[s] since some moment, the same for all processes of a machine. On Linux it goes on while the computer sleeps.
+    """Time [s] from a fixed moment, the same for all processes of a machine.
 
-    Setting the date does not move it.
+    On Linux it runs on while the computer sleeps. Setting the date does not change it.
     """
     return time.monotonic() if _CLOCK is None else time.clock_gettime(_CLOCK)

@@ -1,6 +1,6 @@
-"""A Unitree robot behind the seam ``Robot``: measurements out of its state messages, its command messages out of targets.
+"""A Unitree robot as a ``Robot``: state messages become measurements, targets become command messages.
 
-Motors are found by the names of their joints. Services that must be called before its motors obey are in ``link``.
+Joint names select the motors. ``link`` has the services that must be called before the motors obey.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.remote import decode
 from legged_mw.unitree.robots import Machine, check_body, check_slots, machine_of, order
 
-TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
-TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
-_WRAP = 2**32 / 1000  # [s] after which a robot's tick begins at 0 again
-LOST = 5  # messages that a motor may lose between two looks; ours
+TOO_OLD = 0.1  # [s] ours: an older measurement is not used
+TOUCH = 20  # foot_force of a foot on the ground, in the robot's own unit; ours
+_WRAP = 2**32 / 1000  # [s] after which a robot's tick wraps to 0
+LOST = 5  # ours: messages that a motor may lose between two checks
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
 
 
 class Owner(Protocol):
-    """Who owns the wire: this process (``Direct``), or the guard's (``guard.Guarded``)."""
+    """The owner of the wire: this process (``Direct``) or the guard's (``guard.Guarded``)."""
 
     def receive(self) -> Any:
-        """The newest state with its stamp, or None if none came since the last call."""
+        """The newest state with its stamp; None if none came since the last call."""
 
     def arm(self, damping: bytes) -> None:
-        """Store the command that damps this robot, for when this process can send none."""
+        """Store the command that damps this robot, for a process that can send none."""
 
     def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        """Send a command computed from the state of ``stamp``; ``safe``: it may be repeated for ever."""
+        """Send a command computed from the state of ``stamp`` [s]. ``safe``: it may be repeated forever."""
 
     def close(self, last: bytes) -> str:
-        """Send ``last`` for a while and close; returns a report of latencies, or nothing."""
+        """Send ``last`` for a while and close. Returns a report of latencies, or an empty string."""
         ...
 
 
 class Direct:
-    """A wire in this process, without a guard: for tests in one process."""
+    """A wire in this process without a guard, for tests."""
 
     def __init__(self, wire: Any) -> None:
         self.wire = wire
@@ -72,7 +72,7 @@ class Direct:
 class UnitreeRobot(Robot):
     """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate.
 
-    Targets are sent as they are: ``Safety.held`` holds them within the servos' ranges, for every robot.
+    Targets are sent unchanged: ``Safety.held`` clips them to the servos' ranges, for every robot.
     """
 
     can_change_gains = True
@@ -87,11 +87,12 @@ class UnitreeRobot(Robot):
         odometry: bool = False,
         clock: Callable[[], float] = clock,
     ) -> None:
-        """``first``: the state that the robot sent last. ``odometry``: the velocity is estimated from what it measures.
+        """``first``: the robot's last state. ``odometry``: the velocity is estimated from the measurements.
 
-        ``simulated``: commands name the state that they answer. If its first state has no checksum, or no voltage, the others need none.
+        ``simulated``: each command names the state that it answers. If the first state has no checksum, or no voltage,
+        later ones need none.
 
-        Raises RobotError if this is not the contract's robot, or cannot measure what the policy observes.
+        Raises RobotError if this is not the contract's robot, or cannot measure the policy's observation.
         """
         self.contract, self._owner, self._clock, self._simulated = contract, owner, clock, simulated
         self.machine = machine_of(contract.joints)
@@ -99,7 +100,7 @@ class UnitreeRobot(Robot):
         check_rows(contract, self.machine, odometry)
         self._slots = order(self.machine, contract.joints)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
-        self.report = ""  # after `close`: latencies of the wire
+        self.report = ""  # set by `close`: latencies of the wire
         self._sealed = not simulated or self._state["crc"] != 0
         self._metered = not simulated or self._voltage != 0.0
         if self._sealed and not self._state.intact():
@@ -112,7 +113,7 @@ class UnitreeRobot(Robot):
         self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
         self._left_out = 0  # states since the last good one
-        self.dropped: Counter[str] = Counter()  # states that were not taken, by why
+        self.dropped: Counter[str] = Counter()  # reason -> rejected states
         owner.arm(self._command(kd=damped(contract)))
 
     @property
@@ -121,8 +122,8 @@ class UnitreeRobot(Robot):
 
     @property
     def _voltage(self) -> float:
-        """[V] of the battery."""
-        each = self.machine.package == "unitree_hg"  # each motor says it
+        """Voltage [V] of the battery."""
+        each = self.machine.package == "unitree_hg"  # each motor reports it
         return float(np.median(self._state["motor_state.vol"][self._slots])) if each else float(self._state["power_v"])
 
     def _decoded(self, body: bytes) -> WireMessage:
@@ -149,7 +150,7 @@ class UnitreeRobot(Robot):
         return Measurement(
             lin_vel=np.zeros(3),
             ang_vel=state["imu_state.gyroscope"].astype(float),
-            # as long as the quaternion, squared: of zeros it is no gravity, not a robot that stands level
+            # Its length is the quaternion's, squared. A quaternion of zeros thus gives no gravity, not a level robot.
             gravity=-np.array([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]),
             joint_pos=q,
             joint_vel=dq,
@@ -200,7 +201,7 @@ class UnitreeRobot(Robot):
         )
 
     def _listen(self) -> None:
-        """Take the newest state, if it is whole, and of the same robot. A simulator that sets no tick sends 0 there."""
+        """Take the newest state if it is intact and from the same robot. A simulator without ticks sends 0 there."""
         if not (received := self._owner.receive()):
             return
         state = self._decoded(received.body)
@@ -209,7 +210,7 @@ class UnitreeRobot(Robot):
             self.dropped["with a wrong checksum"] += 1
             return
         back = (int(self._state["tick"]) - int(state["tick"])) % 2**32 / 1000
-        if 0 < back <= TOO_OLD:  # overtaken by a newer one; a clock that goes back further is another robot's
+        if 0 < back <= TOO_OLD:  # overtaken by a newer state; a larger step back means another robot
             self.dropped["late"] += 1
             return
         if TOO_OLD < back < _WRAP / 2:
@@ -221,7 +222,7 @@ class UnitreeRobot(Robot):
             )
 
     def _command(self, **parts: Floats) -> bytes:
-        """A sealed command: ``parts`` (D,) of the joints, zero where not given."""
+        """A command with checksum. ``parts`` (D,) of the joints; other values are zero."""
         machine, command = self.machine, WireMessage(LAYOUTS[self.machine.package, "LowCmd_"])
         used = np.isin(np.arange(machine.slots), self._slots)
         command["motor_cmd.mode"] = np.where(used, [machine.modes.get(i, 1) for i in range(machine.slots)], 0)
@@ -244,7 +245,7 @@ class UnitreeRobot(Robot):
 
 
 def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> None:
-    """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
+    """Refuse a policy with rows that this robot does not measure, or without angle commands. Raises RobotError."""
     if contract.action.origin in ("torque", "speed"):
         raise RobotError(
             f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here"
@@ -263,16 +264,16 @@ def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> 
 def connect(
     folder: Path, contract: Contract, interface: str, domain: int | None = None, odometry: bool = False
 ) -> UnitreeRobot:
-    """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
+    """Connect to the robot on a network interface; a guard process owns the wire. Raises RobotError with the reason."""
     need_dds()
     from legged_mw.unitree.guard import LATE, Guarded
     from legged_mw.unitree.link import LOOPBACK, default_domain
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine, odometry)
-    read_scene(folder, contract)  # a scene that is not the contract's is refused before anything is sent
+    read_scene(folder, contract)  # before anything is sent: refuse a scene that is not the contract's
     domain = default_domain(interface) if domain is None else domain
-    late = max(LATE, 1.5 * contract.period)  # a policy may be slow
+    late = max(LATE, 1.5 * contract.period)  # allow for a slow policy
     owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)
     try:
         return UnitreeRobot(contract, owner, owner.first, simulated=interface in LOOPBACK, odometry=odometry)

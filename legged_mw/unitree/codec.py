@@ -1,7 +1,7 @@
-"""Unitree's low-level messages as bytes: their fields, where each lies on the wire, and the checksum. No DDS here.
+"""Unitree's low-level messages as bytes: fields, their offsets on the wire, and the checksum. No DDS here.
 
-Names, order and widths of the fields are the interface that Unitree publishes in unitree_sdk2: ``unitree_go`` (Go2, B2, H1),
-``unitree_hg`` (G1, H1-2), ``unitree_api`` (the motion service). "byte" stands for IDL's octet, where Unitree's Python writes uint8.
+Names, order and widths of the fields follow Unitree's published unitree_sdk2: ``unitree_go`` (Go2, B2, H1),
+``unitree_hg`` (G1, H1-2), ``unitree_api`` (the motion service). "byte" means IDL's octet; Unitree's Python says uint8.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ STRUCTS: dict[str, dict[str, str]] = {
 }
 _DTYPES = {"byte": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4"}
 HEADER = b"\x00\x01\x00\x00"  # of every sample: plain CDR (XCDR1), little-endian
-_MIRRORED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))  # each byte with its bits turned round
+_MIRRORED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))  # each byte with its bits reversed
 
 
 class Field(NamedTuple):
@@ -62,21 +62,21 @@ class Field(NamedTuple):
 
     name: str
     type: str
-    count: int | None  # None: a single one
+    count: int | None  # None: one value
 
 
 def fields(package: str, struct: str) -> list[Field]:
-    """The fields of a struct, in their order."""
+    """The fields of a struct, in order."""
     found = [re.fullmatch(r"(\w+) (\w+)(?:\[(\d+)\])?", text) for text in STRUCTS[package][struct].split(", ")]
     return [Field(m[1], m[2], int(m[3]) if m[3] else None) for m in found if m]
 
 
 class Layout:
-    """Where each field of a message of fixed size lies: on the wire, and in the C++ struct that the checksum is taken of."""
+    """Field offsets of a fixed-size message: on the wire, and in the C++ struct under the checksum."""
 
     def __init__(self, package: str, struct: str) -> None:
         self.package, self._offsets = package, dict[str, tuple[str, list[int]]]()
-        self._image: list[int] = []  # of each byte on the wire, its place in the C++ struct
+        self._image: list[int] = []  # wire byte -> its offset in the C++ struct
         self.size, self.image_size = self._add(package, struct, "", 0, 0)
         self.index = {n: (kind, np.array(o) // np.dtype(kind).itemsize) for n, (kind, o) in self._offsets.items()}
         self.single = {name for name, (_, where) in self.index.items() if len(where) == 1}
@@ -84,10 +84,10 @@ class Layout:
         self.on_wire, self.in_image = (np.array(each) for each in zip(*spans, strict=True))
 
     def _add(self, package: str, struct: str, prefix: str, wire: int, image: int) -> tuple[int, int]:
-        """Place a struct at these two offsets; returns where both end.
+        """Place a struct at these two offsets. Returns both end offsets.
 
-        On the wire each number is aligned to its own size and nothing else is padded. The compiler aligns structs to their widest
-        number, and pads their ends.
+        On the wire each number is aligned to its own size and nothing else is padded. The compiler aligns structs to
+        their widest number and pads their ends.
         """
         widest = _alignment(package, struct)
         image += -image % widest
@@ -105,7 +105,7 @@ class Layout:
 
 
 def _alignment(package: str, struct: str) -> int:
-    """Size of a struct's widest number."""
+    """Size [byte] of a struct's widest number."""
     return max(
         np.dtype(_DTYPES[f.type]).itemsize if f.type in _DTYPES else _alignment(package, f.type)
         for f in fields(package, struct)
@@ -120,10 +120,10 @@ LAYOUTS = {
 
 
 class WireMessage:
-    """One message as the bytes that travel; ``message["motor_state.q"]`` is the field of all motors, in a copy."""
+    """One message as its bytes on the wire. ``message["motor_state.q"]`` is the field of all motors, copied."""
 
     def __init__(self, layout: Layout, body: bytes | None = None) -> None:
-        """A message of zeros, or the one in ``body``; raises ValueError where that has another size."""
+        """A message of zeros, or of ``body``. Raises ValueError if ``body`` has another size."""
         if body is not None and len(body) != layout.size:
             raise ValueError(f"a message of {len(body)} bytes, not {layout.size}")
         self.layout = layout
@@ -143,25 +143,25 @@ class WireMessage:
         return self._bytes.tobytes()
 
     def checksum(self) -> int:
-        """What the field ``crc`` must be."""
+        """The right value of the field ``crc``."""
         image = np.zeros(self.layout.image_size, dtype=np.uint8)
         image[self.layout.in_image] = self._bytes[self.layout.on_wire]
         return crc32(image[:-4])
 
     def seal(self) -> bytes:
-        """The bytes with their checksum."""
+        """The bytes, with the right checksum."""
         self["crc"] = self.checksum()
         return self.body
 
     def intact(self) -> bool:
-        """Whether its checksum is right."""
+        """True if the checksum is right."""
         return self.checksum() == self["crc"]
 
 
 def crc32(image: NDArray[np.uint8]) -> int:
     """Unitree's checksum of little-endian 32-bit words: polynomial 0x04C11DB7, all ones at first, highest bit first.
 
-    That is zlib's, over the words with their bytes turned round, with the bits of each byte and of the result mirrored.
+    It equals zlib's CRC over the words in reversed byte order, with the bits of each byte and of the result reversed.
     """
     words = image.view("<u4").byteswap().tobytes()
     result = zlib.crc32(words.translate(_MIRRORED)) ^ 0xFFFFFFFF

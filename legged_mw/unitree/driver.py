@@ -1,4 +1,7 @@
-"""What ``legged_mw.deploy --robot unitree`` and ``--serve unitree`` call: deploy finds this module by the name of the flag's value."""
+"""Entry points of ``legged_mw.deploy --robot unitree`` and ``--serve unitree``.
+
+Deploy imports this module by the flag's value.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,12 @@ from legged_mw.unitree.robots import machine_of
 
 
 def senses_feet(contract: Contract) -> bool:
-    """Whether the contract's robot measures its feet's contacts."""
+    """True if the contract's robot measures foot contacts."""
     return bool(machine_of(contract.joints).feet)
 
 
 def connect(folder: Path, contract: Contract, args: argparse.Namespace, odometry: bool) -> Robot:
-    """The robot on the wire."""
+    """Connect to the robot on the wire."""
     robot = client.connect(folder, contract, args.interface, args.domain, odometry=odometry)
     print(
         f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V",
@@ -30,7 +33,7 @@ def connect(folder: Path, contract: Contract, args: argparse.Namespace, odometry
 
 
 def serve(folder: Path, contract: Contract, args: argparse.Namespace, lift: float) -> str:
-    """A simulated robot on the wire; ``lift`` [m]: how far above its start it hangs. Returns what happened, in words."""
+    """Serve a simulated robot on the wire. ``lift`` [m]: height above its start. Returns a report in words."""
     need_dds()
     from legged_mw.unitree import handset, program
     from legged_mw.unitree.faults import parse_faults

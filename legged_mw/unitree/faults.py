@@ -1,4 +1,4 @@
-"""What is wrong with a simulated robot and its wire, on demand: ``--serve unitree --fault NAME[=VALUE][@SECONDS]``."""
+"""Faults of a simulated robot and its wire, on demand: ``--serve unitree --fault NAME[=VALUE][@SECONDS]``."""
 
 from __future__ import annotations
 
@@ -14,42 +14,42 @@ import numpy as np
 from legged_mw.deploy.robot import Floats
 from legged_mw.utils.errors import UserError, unknown
 
-OFF = "off"  # a fault that ends
+OFF = "off"  # value that ends a fault
 
 
 @dataclass
 class Faults:
-    """What is wrong now; may change at any time."""
+    """The present faults. They may change at any time."""
 
-    delay_ms: float = 0.0  # of every message, each way
-    jitter_ms: float = 0.0  # standard deviation of the delay
-    loss: float = 0.0  # share of messages that are lost
+    delay_ms: float = 0.0  # [ms] of every message, each way
+    jitter_ms: float = 0.0  # [ms] standard deviation of the delay
+    loss: float = 0.0  # share of lost messages
     bad_crc: bool = False  # states with a wrong checksum
-    frozen: bool = False  # the same state again and again
-    # parts of the state, by their names in NAN, and joints whose encoders stay the same
+    frozen: bool = False  # the same state is sent again and again
+    # frozen parts of the state, by their names in NAN, and joints with frozen encoders
     stuck: set[str] = field(default_factory=set)
-    silent: bool = False  # no states
+    silent: bool = False  # no states are sent
     no_remote: bool = False  # the remote is off: 40 zeros
-    clock_jump: float = 0.0  # [s] by which the robot's clock is ahead
+    clock_jump: float = 0.0  # [s] that the robot's clock is ahead
     mode_machine: int | None = None  # of another body; None: its own
-    joint_order: int = 0  # places by which the motors are plugged in otherwise
-    turned_joints: set[str] = field(default_factory=set)  # joints whose motors turn the other way
-    dead_motors: set[str] = field(default_factory=set)  # joints whose motors give no torque and say so
+    joint_order: int = 0  # slots by which the motors' plugs are shifted
+    turned_joints: set[str] = field(default_factory=set)  # joints with reversed motors
+    dead_motors: set[str] = field(default_factory=set)  # joints with motors that give no torque and report a fault
     joint_bias: Floats | float = 0.0  # (D,) [rad] added to measured angles
     joint_speed: Floats | float = 0.0  # (D,) [rad/s] added to measured speeds
     gyro_bias: Floats | float = 0.0  # (3,) [rad/s]
-    imu_tilt: float = 0.0  # [deg] by which the measured orientation is rolled
-    imu_swap: str = ""  # axes of the IMU, of SWAPS, that are read one for the other: of quaternion and gyro
-    nan: str = ""  # part of the state that is not a number
+    imu_tilt: float = 0.0  # [deg] roll added to the measured orientation
+    imu_swap: str = ""  # swapped IMU axes, of SWAPS, in quaternion and gyro
+    nan: str = ""  # a part of the state that is NaN
     temperature: float = 35.0  # [deg C] of every motor
-    voltage: float | None = None  # [V]; None: of a full battery
+    voltage: float | None = None  # [V]; None: a full battery
 
 
 class FaultKind(NamedTuple):
-    """A fault by its name on the command line."""
+    """A fault that the command line can name."""
 
     field: str  # of Faults
-    value: Any  # without "=VALUE"; None: it must be stated
+    value: Any  # without "=VALUE"; None: the value is required
     low: float = -math.inf
     high: float = math.inf
     unit: str = ""
@@ -85,9 +85,9 @@ KINDS = {
 
 
 class Fault(NamedTuple):
-    """One fault, and when it begins."""
+    """One fault and its start."""
 
-    text: str  # as it was asked for
+    text: str  # as written on the command line
     field: str  # of Faults
     value: Any
     time: float  # [s]
@@ -95,12 +95,12 @@ class Fault(NamedTuple):
     def begin(self, faults: Faults) -> None:
         value = self.value
         if isinstance(value, set) and value:
-            value = value | getattr(faults, self.field)  # one more joint
+            value = value | getattr(faults, self.field)  # add a joint to the set
         setattr(faults, self.field, value)
 
 
 def parse_faults(texts: Sequence[str], joints: Sequence[str]) -> list[Fault]:
-    """Each text is one or more of NAME[=VALUE][@SECONDS], with commas between them; in the order of their times. Raises UserError."""
+    """Parse comma-separated NAME[=VALUE][@SECONDS] texts; returns the faults sorted by time. Raises UserError."""
     found = [_parse(part, joints) for text in texts for part in text.split(",")]
     return sorted(found, key=lambda fault: fault.time)
 
@@ -152,7 +152,7 @@ def _number(text: str) -> float:
 
 
 class Line:
-    """One direction of the wire: messages come out when their time has come, late, in another order, or never."""
+    """One direction of the wire. Messages come out when due: late, reordered, or never."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._queue, self._count = rng, list[tuple[float, int, bytes]](), 0

@@ -1,10 +1,10 @@
-"""The guard: a small process that owns the wire, so that a robot is damped when the policy's process dies, hangs or is late.
+"""The guard: a small process that owns the wire. It damps the robot if the policy's process dies, hangs or is late.
 
-The policy's process gives it finished commands and gets states back as they came. The guard repeats the newest command at the
-robot's own rate. Once it has damped, it refuses every command: nothing resumes without a person.
+The policy's process sends it finished commands and reads back raw states. The guard repeats the newest command at the
+robot's own rate. Once it has damped, it refuses every command: only a person can start again.
 
-Every signal that would end the guard has it damp first. One that is killed or stopped can damp nothing: then the policy's process,
-which hears of each of its turns, sends damping itself.
+On every signal that would end it, the guard damps first. A killed or stopped guard cannot damp. The policy's process
+sees each turn of the guard, so it notices and sends damping itself.
 """
 
 from __future__ import annotations
@@ -31,41 +31,42 @@ from legged_mw.deploy.robot import RobotError
 from legged_mw.unitree import clock
 from legged_mw.unitree.codec import LAYOUTS
 
-# [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
+# [s] ours: limit without a command, three periods at 50 Hz. docs/faults.md has the time until joints are damped
 LATE = 0.06
-# [s] ours, between two turns of the guard: it was stopped, or this computer slept, and the policy's process damps
+# [s] ours: limit between two turns. Beyond it the guard was stopped or this computer slept; the policy's process damps
 STILL = 0.04
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
-AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
-SIGN = 0.1  # [s] ours, for the guard to answer the last command; then the policy's process damps, too
-START = 60.0  # [s] for a guard to find the robot
-PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
+AFTER = 1.0  # [s] ours: time of damping before the wire is closed
+SIGN = 0.1  # [s] ours: limit for the guard's answer to the last command; then the policy's process damps, too
+START = 60.0  # [s] limit for a guard to find the robot
+PRIORITY = 30  # ours, of a real-time process: above the policy's, since the guard must outlive it
 GONE = "the guard of the wire is gone"
 DEAF = "the guard of the wire does not listen"
 INSTEAD = "this process damps the joints in its place"
-_TURN = 0.001  # [s] at most between two looks at the wire
-# checksum of what follows, time of the guard's turn, stamp of the state, bytes of the text, text
+_TURN = 0.001  # [s] longest pause between two looks at the wire
+# checksum of the rest, time of the guard's turn, stamp of the state, length of the text, text
 _BOARD = struct.Struct("<IddI512s")
-_SUM = 4  # bytes of the checksum
-_LOOKS = 10  # at a board that is being written, before what it last said counts
+_SUM = 4  # [byte] of the checksum
+_LOOKS = 10  # reads of a board in the middle of a write, before the last content counts
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
-# Kinds of command: another must follow in time; may be repeated for ever; the last one; stored for a trip, not sent now.
+# Kinds of command. MOVE: the next one must follow in time. SAFE: may be repeated forever. CLOSE: the last one.
+# ARM: stored for a trip, not sent now.
 MOVE, SAFE, CLOSE, ARM = 1, 2, 3, 4
 
 
 class Posted(NamedTuple):
-    """What the board says."""
+    """The content of the board."""
 
     body: bytes  # of the newest state
-    stamp: float  # [s] when it came
+    stamp: float  # [s] arrival of the state
     text: str  # why the guard damped; "" if it did not
     turn: float  # [s] when the guard last looked at both sides
 
 
 class Board:
-    """Memory of two processes: the guard writes, the policy's process reads the newest.
+    """Shared memory: the guard writes, the policy's process reads the newest content.
 
-    What is read counts if its checksum is right, so that the order in which a processor's writes are seen does not matter.
+    Content counts only with the right checksum: another processor may see the writes in any order.
     """
 
     def __init__(self, file: int, size: int) -> None:
@@ -73,7 +74,7 @@ class Board:
         self._stamp, self._text, self._posted = 0.0, b"", Posted(bytes(size), 0.0, "", 0.0)
 
     def put(self, turn: float, body: bytes | None = None, stamp: float = 0.0, text: str = "") -> None:
-        """A state and a text stay until the next ones."""
+        """Write. A state and a text stay until the next ones."""
         if body is not None:
             self._whole[_BOARD.size :], self._stamp = body, stamp
         self._text = text.encode()[:512] if text else self._text
@@ -82,7 +83,7 @@ class Board:
         self._map[:] = self._whole
 
     def get(self) -> Posted:
-        """What the guard wrote last; if that is not whole, what it said before: it may have been stopped or killed meanwhile."""
+        """The newest intact content. During a write, or after one that was cut off, that is the content before."""
         for _ in range(_LOOKS):
             whole = self._map[:]
             right, turn, stamp, length, text = _BOARD.unpack_from(whole)
@@ -96,9 +97,9 @@ class Board:
 
 
 class Guarded:
-    """The wire as the policy's process sees it, through a guard (see ``client.Owner``).
+    """The policy process's side of the wire, through a guard (see ``client.Owner``).
 
-    If the guard is gone, or is silent while the robot moves, this process sends damping in its place, for good.
+    If the guard ends, or is silent while the robot moves, this process sends damping instead, until the end.
     """
 
     def __init__(
@@ -109,9 +110,10 @@ class Guarded:
         process: subprocess.Popen[bytes] | None = None,
         clock: Callable[[], float] = clock,
     ) -> None:
-        """Of a guard at the other end of ``channel``; ``commander`` sends in its place (``link.Commander``).
+        """Connect to the guard at the other end of ``channel``.
 
-        Raises RobotError with the guard's error if it does not take the robot over.
+        ``commander`` (``link.Commander``) sends if the guard fails.
+        Raises RobotError with the guard's error if it cannot take the robot over.
         """
         self._channel, self._board, self._commander, self.process, self._clock = (
             channel,
@@ -128,7 +130,7 @@ class Guarded:
             raise RobotError(said.get("error", why))
         self._channel.settimeout(0.5)
         self._last, self._damping, self._moving = 0.0, b"", False
-        self._instead = ""  # why this process damps in the guard's place
+        self._instead = ""  # why this process damps instead of the guard
         self.first = self.receive()
 
     @classmethod
@@ -166,11 +168,11 @@ class Guarded:
                 process = subprocess.Popen(
                     [sys.executable, "-c", program, json.dumps(settings)],
                     pass_fds=(theirs.fileno(), file.fileno()),
-                    start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
+                    start_new_session=True,  # Ctrl-C in the terminal must not reach the guard
                 )
         owner = cls(channel, board, commander, process)
         try:
-            commander.wait(2, find)  # the robot, and the guard that listens for others
+            commander.wait(2, find)  # two readers: the robot, and the guard, which listens for other commanders
         except RobotError:
             owner.close(b"")
             raise
@@ -179,7 +181,7 @@ class Guarded:
     def receive(self) -> Any:
         from legged_mw.unitree.link import Received
 
-        now = self._clock()  # before the board: a pause between the two is not the guard's
+        now = self._clock()  # before reading the board, so a pause between the two does not count as the guard's
         body, stamp, text, turn = self._board.get()
         silent, known = now - turn, self._instead
         if self._ended():
@@ -187,7 +189,7 @@ class Guarded:
         elif self._moving and silent > STILL:
             self._damp_instead(f"the guard of the wire was silent for {1000 * silent:.0f} ms")
         if text or self._instead:
-            # a guard that goes on takes this process for another program
+            # a running guard takes this process for another program, and says so; report the first cause
             raise RobotError(known or text or self._instead)
         if stamp == self._last:
             return None
@@ -206,7 +208,7 @@ class Guarded:
             self._commander.send(self._damping)
 
     def close(self, last: bytes) -> str:
-        """Returns the latency of measurements, as the guard saw it; of a guard that does not answer, why this process damped."""
+        """Returns the latency of measurements, from the guard. Without its answer: why this process damped."""
         said: dict[str, Any] = {}
         if asked := bool(last) and not self._instead and self._channel.fileno() >= 0:
             self._put(CLOSE, 0.0, last)
@@ -218,7 +220,7 @@ class Guarded:
             self._commander.send(self._damping)
             time.sleep(REPEAT)
         if asked and not said:
-            said = self._answer()  # of one that was only slow
+            said = self._answer()  # a slow guard may answer now
         self._channel.close()
         if self.process:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -226,7 +228,7 @@ class Guarded:
         return said.get("report", self._instead if asked else "")
 
     def _ended(self) -> bool:
-        """Whether the guard's end of the channel is closed."""
+        """True if the guard's end of the channel is closed."""
         if self._channel.fileno() < 0:
             return True
         with contextlib.suppress(OSError):
@@ -234,7 +236,7 @@ class Guarded:
         return True
 
     def _damp_instead(self, why: str) -> None:
-        """From now on this process sends damping. A guard that still runs damps as well: see ``WireGuard.turn``."""
+        """Send damping from this process from now on. A guard that still runs damps, too: see ``WireGuard.turn``."""
         if self._damping and not self._instead:
             self._instead = f"{why}; {INSTEAD}"
             self._commander.send(self._damping)
@@ -282,13 +284,13 @@ class WireGuard:
         )
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
-        self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
+        self._command, self._damping = b"", b""  # the repeated command; its replacement after a trip
         self._moving, self._heard, self._until, self._due, self._looked = False, 0.0, float("inf"), 0.0, clock()
         self.tripped, self._stopped = "", 0
         channel.setblocking(False)
 
     def stop(self, number: int = signal.SIGTERM, *_: object) -> None:
-        """Damp, and end; a signal's handler."""
+        """Signal handler: damp and end."""
         self._stopped = number
 
     def run(self) -> None:
@@ -298,10 +300,10 @@ class WireGuard:
             self.turn()
 
     def turn(self) -> None:
-        """One look at both sides. A command is obeyed last: it may have waited while the guard stood still."""
+        """Look at both sides once. New commands come last, since they may have waited while the guard was stopped."""
         now = self.clock()
         still, self._looked = now - self._looked, now
-        if still < 0.0:  # what was to happen at a time happens as much earlier
+        if still < 0.0:  # the clock went back: shift all stored times
             self._heard, self._until, self._due = (each + still for each in (self._heard, self._until, self._due))
         if self._moving and still < 0.0:
             self.trip(f"this computer's clock went back by {-still:.1f} s")
@@ -323,7 +325,7 @@ class WireGuard:
         self.board.put(now, *(self.wire.receive() or ()))
 
     def _hear(self, now: float) -> None:
-        """Take what the policy's process sent; the newest command counts."""
+        """Take the messages of the policy's process; the newest command counts."""
         if self.channel.fileno() < 0:
             return
         try:
@@ -349,7 +351,7 @@ class WireGuard:
             self._damping = body
         elif kind == CLOSE:
             self._command, self._moving, self._until = body, False, now + AFTER
-            self.wire.send(body)  # before the answer: from then on nobody else sends it
+            self.wire.send(body)  # before the answer: after it no other process sends this command
             self.tell({"report": self._report()})
         elif not self.tripped:
             self._command, self._moving, self._heard = body, kind == MOVE, now
@@ -358,12 +360,12 @@ class WireGuard:
                 self._latencies.append(self.clock() - stamp)
 
     def _send(self) -> None:
-        """The command, unless the guard was stopped since this turn began: then the next one damps."""
+        """Send the command, unless the guard was stopped during this turn; then the next turn damps."""
         if self.clock() - self._looked <= self.still:
             self.wire.send(self._command)
 
     def trip(self, why: str) -> None:
-        """Damp from now on, and say why; the first reason counts."""
+        """Damp from now on and report why; only the first reason counts."""
         if self._command:
             self._command = self._damping
             self.wire.send(self._command)
@@ -371,7 +373,7 @@ class WireGuard:
             self.tripped, self._moving = why, False
             done = f"{why}; the joints are damped" if self._command else why
             self.board.put(self._looked, text=done)
-            with contextlib.suppress(OSError):  # a terminal that is gone
+            with contextlib.suppress(OSError):  # the terminal is gone
                 print(f"guard: {done}", file=sys.stderr, flush=True)
 
     def _report(self) -> str:
@@ -387,8 +389,8 @@ class WireGuard:
             self.channel.sendall(json.dumps(what).encode() + b"\n")
 
 
-# Signals that do not end the guard: which nobody can catch, which end nothing, and those of its own errors, to which a handler would
-# return for ever.
+# Signals that keep their handlers: those that cannot be caught, those that end nothing, and those of the guard's own
+# errors (a handler would return to the error forever).
 KEPT = {
     getattr(signal, f"SIG{name}")
     for name in ("KILL", "STOP", "CHLD", "CONT", "URG", "WINCH", "PIPE", "SEGV", "BUS", "FPE", "ILL")
@@ -406,7 +408,8 @@ def main() -> None:
     channel = socket.socket(fileno=settings["channel"])
     real_time(PRIORITY, heirs=True)  # before DDS starts its threads
     try:
-        claimed = claim(settings["interface"], settings["domain"], 2 * AFTER)  # a guard before this one may still damp
+        # the guard before this one may still damp
+        claimed = claim(settings["interface"], settings["domain"], 2 * AFTER)
         wire = Wire(settings["package"], settings["interface"], settings["domain"])
         first = wire.prepare(settings["find"], lies_down=settings["lies_down"])
     except RobotError as error:

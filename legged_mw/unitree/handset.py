@@ -1,10 +1,12 @@
-"""Who holds the remote of a simulated robot: a YAML script of timed inputs, or the keys of this terminal.
+"""The remote of a simulated robot, from a YAML script of timed inputs or from this terminal's keys.
 
 remote:
   - {time: 1, press: [start]}            # buttons are held for a moment
   - {time: 5, press: [A]}
   - {time: 6, hoist: false}              # lower the robot from its hoist
-  - {time: 8, ly: 0.5, rx: -0.2}         # sticks are held until the next entry that names them; ahead, right and right are positive
+  - {time: 8, ly: 0.5, rx: -0.2}         # a stick is held until the next entry that names it
+
+Positive sticks: ahead (ly, ry) and right (lx, rx).
 """
 
 from __future__ import annotations
@@ -23,9 +25,9 @@ from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 
 STICKS = ("lx", "ly", "rx", "ry")
-HELD = 0.1  # [s] ours: how long a button is pressed
-_STEP = 0.1  # of a stick, a key
-# key -> stick and its change, buttons, or what is done with the hoist
+HELD = 0.1  # [s] ours: duration of a button press
+_STEP = 0.1  # stick change per key press
+# key -> stick and its change, buttons, or a hoist action
 KEYS = {
     "w": ("ly", _STEP),
     "s": ("ly", -_STEP),
@@ -39,7 +41,7 @@ KEYS_HELP = "keys: 1 start, 2 A (policy), x select (damping), ! L2+B (stop), w s
 
 
 class RemoteEvent(NamedTuple):
-    """What happens at a time."""
+    """One timed input."""
 
     time: float  # [s]
     press: tuple[str, ...] = ()
@@ -48,7 +50,7 @@ class RemoteEvent(NamedTuple):
 
 
 def load_remote(path: Path) -> list[RemoteEvent]:
-    """The entries of a script, in the order of their times. Raises ConfigError."""
+    """Read a script, sorted by time. Raises ConfigError."""
     listed = load_yaml(path).get("remote")
     if not isinstance(listed, list) or not listed:
         raise ConfigError(f"{path}: write one list 'remote' with at least one entry, e.g. {{time: 1, press: [start]}}")
@@ -80,14 +82,14 @@ def _number(value: object) -> bool:
 
 
 class Handset:
-    """The remote as it is held now."""
+    """The present state of the remote."""
 
     def __init__(self, script: Sequence[RemoteEvent] = (), keys: bool = False) -> None:
         """``keys``: read this terminal, which must be one."""
         self._script, self._next = list(script), 0
         self._sticks: dict[str, float] = dict.fromkeys(STICKS, 0.0)
         self._buttons, self._until = tuple[str, ...](), -math.inf
-        self.off, self.hoist = False, None  # None: nobody said
+        self.off, self.hoist = False, None  # None: no input named it yet
         self._keys, self._before = keys, None
         if keys:
             import termios
@@ -97,7 +99,7 @@ class Handset:
             tty.setcbreak(sys.stdin)
 
     def state(self, time: float) -> bytes:
-        """The 40 bytes at a time [s]; times rise from call to call."""
+        """The remote's 40 bytes at ``time`` [s], which must not decrease."""
         while self._next < len(self._script) and self._script[self._next].time <= time + 1e-9:
             entry = self._script[self._next]
             self._next += 1
@@ -129,7 +131,7 @@ class Handset:
             self.off = not self.off
 
     def close(self) -> None:
-        """Give the terminal back."""
+        """Restore the terminal."""
         if self._before is not None:
             import termios
 

@@ -1,8 +1,9 @@
-"""The types that cyclonedds announces, made of the tables in ``codec``.
+"""The DDS types for cyclonedds, built from the tables in ``codec``.
 
-Two things must be Unitree's to the bit: a type's name, and the hash that DDS makes of its fields. Unitree's robots run Cyclone
-0.10.2, which has no type of 8 bits but the octet. A field declared ``uint8`` under cyclonedds 11 gives another hash; 0.10.2 then asks
-for the type and crashes on the answer. So a byte is an octet here, and ``wrong_hash`` compares with what the robots announce.
+Two things must match Unitree's exactly: a type's name, and the hash that DDS computes of its fields. Unitree's robots
+run Cyclone 0.10.2, which has octet as its only 8-bit type. A field declared ``uint8`` under cyclonedds 11 gives another
+hash; 0.10.2 then requests the type and crashes on the answer. So a byte is an octet here, and ``wrong_hash`` compares
+the hashes with those of the robots.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _PLAIN = {"str": str, "bool": bool, "sequence": types.sequence[types.byte]}
 
 
 def _make(package: str, name: str, made: dict[str, Any]) -> Any:
-    """One struct; those inside of it are in ``made``."""
+    """Build one struct. ``made`` holds its inner structs."""
     members = {}
     for field in fields(package, name):
         kind = made.get(field.type) or _PLAIN.get(field.type) or getattr(types, field.type)
@@ -49,7 +50,7 @@ TYPES: dict[tuple[str, str], Any] = _types()
 
 
 def _raw(base: Any, size: int) -> Any:
-    """``base`` with samples that hold the message's bytes: cyclonedds' own codec takes a millisecond a message."""
+    """``base`` with samples of raw bytes, since cyclonedds' own codec takes a millisecond per message."""
 
     def __init__(self: Any, body: bytes = bytes(size)) -> None:
         self.body = body
@@ -60,7 +61,7 @@ def _raw(base: Any, size: int) -> Any:
         return cls(body[:size] if little else b"")  # another encoding shows as a message of the wrong size
 
     def deserialize_key(cls: Any, *_: Any, **__: Any) -> Any:
-        return cls(b"")  # of a writer that has gone
+        return cls(b"")  # the writer has left
 
     methods: dict[str, Any] = {
         "__init__": __init__,
@@ -78,7 +79,7 @@ RAW: dict[tuple[str, str], Any] = {key: _raw(_copies[key], layout.size) for key,
 
 
 def hashes() -> dict[tuple[str, str], str]:
-    """The complete XTypes hash of each type that crosses the wire."""
+    """The complete XTypes hash of each type on the wire."""
     found = {}
     for key in HASHES:
         TYPES[key].__idl__.populate()
@@ -87,7 +88,7 @@ def hashes() -> dict[tuple[str, str], str]:
 
 
 def wrong_hash() -> str:
-    """The first type that would be announced otherwise than the robots announce it, in words; empty if all are right."""
+    """The first type with a hash that differs from the robots', in words; empty if all match."""
     for (package, name), found in hashes().items():
         if found != (right := HASHES[package, name]):
             return f"{package} {name} as {found}, not {right}"

@@ -29,26 +29,29 @@ from legged_mw.utils.errors import printable, unknown
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
 MOTION = "rt/api/motion_switcher/request", "rt/api/motion_switcher/response"
 SPORT = "rt/api/sport/request"
-CHECK_MODE, RELEASE_MODE = 1001, 1003  # of the motion service
-STAND_DOWN = 1005  # of the sport service [unitree_sdk2]
+CHECK_MODE, RELEASE_MODE = 1001, 1003  # calls of the motion service
+STAND_DOWN = 1005  # call of the sport service [unitree_sdk2]
 LOOPBACK = ("lo", "lo0")
-AGAIN = 0.1  # [s] ours: a robot that was heard within it was not started again
-LEASE = 11.0  # [s] for a program that was killed to be forgotten: DDS's 10, and a margin
+AGAIN = 0.1  # [s] ours: a robot heard within this time was not restarted
+LEASE = 11.0  # [s] until DDS forgets a killed program: its 10, and a margin
 _INTERFACE = "<General><Interfaces><NetworkInterface name='{name}' {multicast}/></Interfaces>{more}</General>"
-# Loopback interfaces know no multicast, so the processes look for each other at 127.0.0.1, one port after the other.
+# Loopback interfaces have no multicast, so the processes search for each other at 127.0.0.1, port by port.
 _LOCAL = "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
 _LOCAL += "<Peers><Peer Address='127.0.0.1'/></Peers></Discovery>"
-# domain -> interface, and what keeps it; a process may configure a domain only once
+# domain -> interface and its Domain object; a process may configure a domain only once
 _joined: dict[int, tuple[str, Any]] = {}
 
 
 def default_domain(interface: str) -> int:
-    """0, a robot's own; on loopback 1, which unitree_mujoco takes."""
+    """The default domain: 0, a robot's own; on loopback 1, as in unitree_mujoco."""
     return 1 if interface in LOOPBACK else 0
 
 
 def join(interface: str, domain: int) -> Any:
-    """A participant of the domain. Raises RobotError if there is no such interface, or if joining could harm the robots on it."""
+    """A participant of the domain.
+
+    Raises RobotError if the interface is missing, or if joining could harm the robots on it.
+    """
     names = [name for _, name in socket.if_nameindex()]
     if interface not in names:
         raise RobotError(f"--interface: {unknown('network interface', interface, names, 'this machine')}")
@@ -77,17 +80,20 @@ def join(interface: str, domain: int) -> Any:
 
 
 def _joined_by(owner: object, interface: str, domain: int) -> Any:
-    """A participant that leaves with its owner: cyclonedds alone never lets one leave that the garbage collector finds in a cycle."""
+    """A participant that leaves when its owner is freed.
+
+    Without this, cyclonedds never lets a participant leave that the garbage collector finds in a cycle.
+    """
     participant = join(interface, domain)
     finalize(owner, participant.__del__).atexit = False
     return participant
 
 
 def claim(interface: str, domain: int, seconds: float) -> socket.socket | None:
-    """What one process of this computer can hold at a time, and holds until it ends: the right to command the robot there.
+    """Claim the right to command the robot on this interface, for one process of this computer, until it ends.
 
-    Listening alone would miss another program that has not sent yet, or is silent for a moment. Waits ``seconds`` for one that is
-    about to end; raises RobotError if it does not. Systems without abstract sockets have no such thing.
+    Listening alone would miss another program that has not sent yet or pauses. Waits ``seconds`` for one that is about
+    to end, then raises RobotError. Systems without abstract sockets have no claim.
     """
     if not sys.platform.startswith("linux"):
         return None
@@ -108,7 +114,7 @@ def taken(where: str) -> str:
 
 
 def _reader(participant: Any, topic: str, kind: Any, depth: int = 1, foreign: bool = False) -> Any:
-    """The newest ``depth`` samples; ``foreign``: not those that this participant wrote."""
+    """A reader of the newest ``depth`` samples. ``foreign``: without those of this participant."""
     policies = [Policy.Reliability.BestEffort, Policy.History.KeepLast(depth)]
     policies += [Policy.IgnoreLocal.Participant] if foreign else []
     return DataReader(participant, Topic(participant, topic, kind), Qos(*policies))
@@ -119,10 +125,10 @@ def _writer(participant: Any, topic: str, kind: Any) -> Any:
 
 
 def _taken(reader: Any, count: int = 1) -> list[Any]:
-    """Samples with data: a writer that goes leaves one without. What cannot be decoded is dropped, and its neighbours with it."""
+    """Samples with data; a writer that leaves sends one without. One undecodable sample drops all of this call."""
     try:
         return [sample for sample in reader.take(count) if sample.sample_info.valid_data]
-    except Exception as error:  # whatever cyclonedds' own codec meets in bytes that are no message
+    except Exception as error:  # cyclonedds' codec may raise anything on bytes that are no message
         if isinstance(error, DDSException):
             raise
         return []
@@ -139,14 +145,14 @@ def _request(call: int) -> Any:
 
 
 class Received(NamedTuple):
-    """One message, and when it came."""
+    """One message and its time of arrival."""
 
     body: bytes
     stamp: float  # [s] of `unitree.clock`
 
 
 class Commander:
-    """The right to send commands, and nothing else: what a policy's process has in case its guard is gone."""
+    """Can only send commands. A policy's process uses it if its guard is gone."""
 
     def __init__(self, package: str, interface: str, domain: int) -> None:
         self.package, self._where = package, f"domain {domain} on {interface}"
@@ -159,12 +165,12 @@ class Commander:
         self._out.write(self._sample(body))
 
     def wait(self, readers: int, seconds: float) -> None:
-        """Until so many programs read commands, so that the first one is not lost. Raises RobotError if they do not."""
+        """Wait until this many ``readers`` read commands, so that none is lost. Raises RobotError after ``seconds``."""
         if not self._until(lambda: len(self._out.get_matched_subscriptions()) >= readers, seconds):
             raise RobotError(f"no robot reads {COMMANDS} in {self._where}: nothing was sent")
 
     def _until(self, found: Callable[[], Any], seconds: float) -> Any:
-        """The first result of ``found`` that is true; after so many seconds its last one."""
+        """Call ``found`` until its result is true; returns it. After ``seconds`` it returns the last result."""
         end = self.clock() + seconds
         while not (result := found()) and self.clock() < end:
             self._wait()
@@ -174,7 +180,7 @@ class Commander:
 class Wire(Commander):
     """The program's end: states come in, commands go out. Nothing is sent before ``send``."""
 
-    _sent = "nothing was sent"  # so far, for errors
+    _sent = "nothing was sent"  # at this point; for errors
 
     def __init__(
         self,
@@ -184,7 +190,10 @@ class Wire(Commander):
         wait: Callable[[], None] = lambda: time.sleep(0.001),
         clock: Callable[[], float] = clock,
     ) -> None:
-        """``wait`` passes a moment while nothing comes. In one process with a simulated robot, that moves on there, by its own clock."""
+        """``wait`` passes a moment while nothing comes.
+
+        With a simulated robot in the same process, ``wait`` steps it, and ``clock`` is its clock.
+        """
         super().__init__(package, interface, domain)
         self._wait, self.clock = wait, clock
         self._size = LAYOUTS[package, "LowState_"].size
@@ -194,11 +203,11 @@ class Wire(Commander):
         self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
         self._sport = _writer(self._participant, SPORT, TYPES["unitree_api", "Request_"])
         self.dropped = 0  # states of another size or encoding
-        # publisher of the robot's states; when each was heard last [s]
+        # publisher of the robot's states; publisher -> [s] of its last state
         self._robot, self._heard = 0, dict[int, float]()
 
     def receive(self) -> Received | None:
-        """The newest state since the last call, with the moment of this call: ask often."""
+        """The newest state since the last call, stamped with the time of this call: call often."""
         for sample in _taken(self._states):
             if len(sample.body) == self._size:
                 now = self.clock()
@@ -208,14 +217,14 @@ class Wire(Commander):
         return None
 
     def other_commander(self) -> bool:
-        """Whether somebody else sent a command since the last call."""
+        """True if another program sent a command since the last call."""
         return bool(_taken(self._others))
 
     def another_robot(self) -> str:
-        """Why states may come from another robot than the one that was prepared; "" if they do not.
+        """Why states may come from another robot than the prepared one; "" if they do not.
 
-        Publishers are counted: what they say, and when, may be the same. If the prepared robot was heard within AGAIN [s], a new publisher
-        is another robot; else it may be the same robot, started again.
+        It counts publishers, since the states of two robots may be equal. A new publisher within AGAIN [s] of the
+        prepared robot's last state is another robot. Later it may be the same robot, restarted.
         """
         others = self._publishers() - {self._robot}
         if not self._robot or not others:
@@ -225,11 +234,14 @@ class Wire(Commander):
         return f"the robot was started again: another program publishes its {STATES}"
 
     def _publishers(self) -> set[int]:
-        """Of states, as samples name them: without a sign."""
+        """Publishers of states, by the unsigned handle that samples carry."""
         return {handle % 2**64 for handle in self._states.get_matched_publications()}
 
     def _one_robot(self, seconds: float) -> None:
-        """Refuse two; a program that was killed is counted until its lease is over, so it is waited for. Raises RobotError."""
+        """Refuse two robots. Raises RobotError.
+
+        A killed program counts until its lease is over, so wait for that.
+        """
 
         def known() -> bool:
             self.receive()
@@ -241,10 +253,10 @@ class Wire(Commander):
         self._robot = next(iter(self._heard))
 
     def prepare(self, seconds: float = 5.0, listen: float = 0.5, lies_down: bool = False) -> Received:
-        """Wait for the robot, take it from its own motion service, and listen for other commanders; returns its state.
+        """Wait for the robot, switch off its motion service and listen for other commanders. Returns its state.
 
-        ``lies_down``: it can be asked to, so that it does not fall when its own program lets go. Raises RobotError with what is
-        wrong; no command was sent then.
+        ``lies_down``: the robot lies down first, so that it does not fall when its own program lets go.
+        Raises RobotError with the reason; no command was sent then.
         """
         if not (state := self._until(self.receive, seconds)):
             raise RobotError(self._nobody(seconds))
@@ -267,10 +279,10 @@ class Wire(Commander):
         return f"{text}; is it on, is this the right network interface, and can it be pinged (192.168.123.161)?"
 
     def _release(self, lies_down: bool, tries: int = 8) -> None:
-        """Switch the robot's own motion programs off; without such a service there is nothing to switch off."""
+        """Switch off the robot's own motion programs. Without such a service there are none."""
         if not self._until(self._requests.get_matched_subscriptions, 0.5):
             return
-        name, moment = "", 0.2 if self._where.endswith(LOOPBACK) else 3.0  # [s; unitree_sdk2's examples wait 1 to 5 s]
+        name, moment = "", 0.2 if self._where.endswith(LOOPBACK) else 3.0  # [s] unitree_sdk2's examples wait 1 to 5 s
         for attempt in range(tries):
             if not (name := self._program()):
                 return
@@ -285,7 +297,7 @@ class Wire(Commander):
         )
 
     def _program(self) -> str:
-        """The program that holds the motors; "" if none does."""
+        """The program that controls the motors; "" if there is none."""
         try:
             said = json.loads(answer := self._ask(CHECK_MODE) or "{}")
             name = said.get("name", "") if isinstance(said, dict) else None
@@ -298,9 +310,9 @@ class Wire(Commander):
         return printable(name)
 
     def _ask(self, call: int, tries: int = 5) -> str:
-        """One call of the motion service; returns its data.
+        """Call the motion service and return its data.
 
-        Asked again each second: an answer is lost that the robot sent before it had discovered who listens for it.
+        Repeat the call each second: the robot's answer is lost if it has not discovered this reader yet.
         """
         asked: set[int] = set()
         for _ in range(tries):
@@ -315,7 +327,7 @@ class Wire(Commander):
 
 
 class RobotEnd:
-    """The robot's end of the wire, for a simulated one: states go out, commands and calls of the motion service come in."""
+    """The wire's end of a simulated robot: states go out, commands and calls of the motion service come in."""
 
     def __init__(self, package: str, interface: str, domain: int) -> None:
         self._participant = _joined_by(self, interface, domain)
@@ -325,8 +337,8 @@ class RobotEnd:
         self._requests = _reader(self._participant, MOTION[0], TYPES["unitree_api", "Request_"], depth=10)
         self._answers = _writer(self._participant, MOTION[1], TYPES["unitree_api", "Response_"])
         self._sport = _reader(self._participant, SPORT, TYPES["unitree_api", "Request_"], depth=10)
-        self.program = "normal"  # the motion program that holds the motors; "" once released
-        self.calls: list[int] = []  # of its services, in their order
+        self.program = "normal"  # the motion program that controls the motors; "" once released
+        self.calls: list[int] = []  # calls of its services, in order
 
     def send(self, body: bytes) -> None:
         self._out.write(self._sample(body))
@@ -337,7 +349,7 @@ class RobotEnd:
         return taken[-1].body if taken else None
 
     def answer(self) -> None:
-        """Answer the calls of the motion service; a call of the sport service needs no answer."""
+        """Answer calls of the motion service. Calls of the sport service need no answer."""
         self.calls += [request.header.identity.api_id for request in _taken(self._sport, 10)]
         header, status = TYPES["unitree_api", "ResponseHeader_"], TYPES["unitree_api", "ResponseStatus_"]
         for request in _taken(self._requests, 10):

@@ -1,4 +1,4 @@
-"""What `--serve unitree` does: a simulated robot on the wire, in real time, until its time is over or somebody ends it."""
+"""The program of `--serve unitree`: a simulated robot on the wire, in real time, until the time is over or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from legged_mw.unitree.handset import Handset
 from legged_mw.unitree.robots import machine_of
 from legged_mw.unitree.serve import STEP, ServedRecord, SimulatedUnitree
 
-BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
-PRIORITY = 10  # ours, of a real-time process: below those of a policy
-UPRIGHT = 0.5  # cosine of the tilt from which it lies
+BEHIND = 0.1  # [s] of delay beyond which the simulation drops the lost time
+PRIORITY = 10  # ours, of a real-time process: below a policy's
+UPRIGHT = 0.5  # cosine of the tilt at which a robot counts as lying
 
 
 @dataclass
 class Served:
-    """What a simulated robot saw while it was served."""
+    """The record of a served robot."""
 
-    seconds: float  # simulated
-    wall: float  # [s]
+    seconds: float  # [s] simulated
+    wall: float  # [s] of real time
     upright: float  # cosine of its largest tilt while its servos were on
-    latencies: list[float]  # [s] from a state that it sent to the first command that answers it
+    latencies: list[float]  # [s] from a sent state to the first command that answers it
     place: tuple[float, float, float]  # [m] of the root at the end
     record: ServedRecord
-    faults: Sequence[Fault]  # that have begun
+    faults: Sequence[Fault]  # those that began
 
     def text(self) -> str:
         record = self.record
@@ -64,15 +64,15 @@ class Served:
 
 
 class Latency:
-    """Times between states that were sent and the first commands that answer them, which name their state in ``reserve``."""
+    """Latencies from a sent state to the first command that answers it. A command names its state in ``reserve``."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
-        self._sent: dict[int, float] = {}  # tick -> when
+        self._sent: dict[int, float] = {}  # tick -> [s] sent
         self._answered = 0
 
     def watch(self, sim: SimulatedUnitree) -> None:
-        """After each step."""
+        """Call after each step."""
         now = time.monotonic()
         self._sent[sim.tick] = now
         if sim.command is not None and (tick := int(np.ravel(sim.command["reserve"])[0])) > self._answered:
@@ -83,7 +83,7 @@ class Latency:
 
 
 def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faults: Sequence[Fault] = ()) -> Served:
-    """Step the robot in real time, its remote held by ``handset``; ``faults`` in the order of their times. Ctrl-C ends it."""
+    """Step the robot in real time, with the remote of ``handset``. ``faults`` are sorted by time. Ctrl-C ends it."""
     latency, upright = Latency(), 1.0
     gc.collect()
     gc.freeze()
@@ -133,11 +133,11 @@ def serve(
     hoist: bool | None = None,
     lift: float = 0.0,
 ) -> Served:
-    """A simulated robot of the export on a network interface."""
+    """Serve a simulated robot of the export on a network interface."""
     need_dds()
     from legged_mw.unitree.link import RobotEnd, default_domain
 
-    real_time(PRIORITY, heirs=True)  # a robot's own computer does nothing else either
+    real_time(PRIORITY, heirs=True)  # a robot's own computer does nothing else, either
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)

@@ -1,4 +1,4 @@
-"""Unitree's robots as their messages see them: which motor is which joint, and what their commands must say."""
+"""Unitree's robots in their messages: the motor of each joint, and the required values of their commands."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class Machine:
     name: str
     package: str  # of its messages
     motors: dict[str, int]  # joint -> slot in LowCmd_ and LowState_ [unitree_sdk2's headers and examples]
-    modes: dict[int, int] = field(default_factory=dict)  # slot -> motor mode where it is not 1
+    modes: dict[int, int] = field(default_factory=dict)  # slot -> motor mode, if not 1
     feet: tuple[str, ...] = ()  # order of foot_force
-    lies_down: bool = False  # whether its own program can be asked to lay it down
-    cells: int = 0  # of the battery, in a row [Unitree's data sheets]; 0: not known
+    lies_down: bool = False  # true if the robot's own program can lay it down
+    cells: int = 0  # battery cells in series [Unitree's data sheets]; 0: unknown
 
     @property
     def limits(self) -> dict[str, float]:
-        """Limits of the safety layer that are this machine's: 3 V a cell, where lithium batteries are called empty."""
+        """This machine's safety limits: 3 V a cell, where lithium batteries count as empty."""
         return {"voltage": 3.0 * self.cells} if self.cells else {}
 
     @property
@@ -77,12 +77,12 @@ H1 = Machine(
     modes={i: 0x0A if i < 10 else 0x01 for i in range(20)},  # strong motors, then weak ones
 )
 MACHINES = {machine.name: machine for machine in (GO2, G1, H1)}
-_LACKS = {23: (13, 14, 20, 21, 27, 28)}  # slots without a motor in a G1 of so many joints [unitree_sdk2's example]
-BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # joints of a G1 by mode_machine [unitree_rl_lab]
+_LACKS = {23: (13, 14, 20, 21, 27, 28)}  # slots without a motor in a G1 with so many joints [unitree_sdk2's example]
+BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # mode_machine -> joints of a G1 [unitree_rl_lab]
 
 
 def machine_of(joints: Sequence[str]) -> Machine:
-    """The robot that has these joints, in whatever order. Raises RobotError with both lists."""
+    """The robot with these joints, in any order. Raises RobotError with both lists."""
     for machine in MACHINES.values():
         if set(joints) == set(machine.motors):
             return machine
@@ -99,12 +99,12 @@ def machine_of(joints: Sequence[str]) -> Machine:
 
 
 def order(machine: Machine, joints: Sequence[str]) -> np.ndarray:
-    """The slot of each joint (D,)."""
+    """Slot of each joint (D,)."""
     return np.array([machine.motors[name] for name in joints])
 
 
 def known_motors(package: str) -> str:
-    """The robots that speak ``package``, and the joints of each."""
+    """The robots with messages of ``package``, and the joints of each."""
     return (
         "; ".join(f"{m.name} has {', '.join(m.motors)}" for m in MACHINES.values() if m.package == package)
         or f"{package} is not known"
@@ -112,9 +112,9 @@ def known_motors(package: str) -> str:
 
 
 def check_slots(machine: Machine, answers: np.ndarray) -> None:
-    """Refuse a robot with motors that answer (slots,) where this one has none: an H1 by a Go2's contract. Raises RobotError.
+    """Refuse a robot with answers (slots,) from motors that are missing here, e.g. an H1 with a Go2's contract.
 
-    Fewer motors are not noticed: not all simulators set all that a motor answers.
+    Fewer motors pass: some simulators set only a part of a motor's answer. Raises RobotError.
     """
     if machine.package == "unitree_go" and (
         more := sorted({*np.flatnonzero(answers).tolist()} - {*machine.motors.values()})
@@ -126,7 +126,10 @@ def check_slots(machine: Machine, answers: np.ndarray) -> None:
 
 
 def check_body(machine: Machine, mode_machine: int) -> None:
-    """Refuse a G1 with other motors than the contract's; a simulation that sets no mode_machine sends 0. Raises RobotError."""
+    """Refuse a G1 with other motors than the contract's. Raises RobotError.
+
+    A simulation without mode_machine sends 0, which passes.
+    """
     if machine is G1 and mode_machine and BODIES.get(mode_machine) != len(machine.motors):
         count = BODIES.get(mode_machine)
         has = f"{count} joints" if count else "an unknown body"

@@ -1,7 +1,7 @@
-"""A simulated robot at the other end of the wire: MuJoCo at the rate of the motors, behind Unitree's messages.
+"""A simulated robot at the other end of the wire: MuJoCo at the motors' rate, behind Unitree's messages.
 
-Each step of 2 ms sends a state, takes the newest command and moves on by the motors' law tau + kp (q - q_now) + kd (dq - dq_now).
-Without a watchdog, as on a robot, the last command holds for ever.
+Each step of 2 ms sends a state, takes the newest command and applies tau + kp (q - q_now) + kd (dq - dq_now).
+Without a watchdog the last command holds forever, as on a robot.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -27,56 +27,60 @@ from legged_mw.unitree.faults import NAN, SWAPS, Faults, Line
 from legged_mw.unitree.remote import encode
 from legged_mw.unitree.robots import Machine, machine_of, order
 
-STEP = 0.002  # [s]; robots send their state at 500 Hz
-# in q and dq: no control of the position, of the velocity [unitree_sdk2]
+STEP = 0.002  # [s] robots send their state at 500 Hz
+# in q and dq: no position control, no velocity control [unitree_sdk2]
 POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0
 LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
-_MACHINE = {"g1": 5}  # mode_machine that a simulated one says
-_TOUCH = 60  # foot_force of a foot that touches the ground, in the robot's own unit; ours
-_FULL = 4.1  # [V] of a full battery's cell
-_MOST = 1e10  # of any part, which NaN is not below; ours: above POSITION_STOP, and its square is a number
+_MACHINE = {"g1": 5}  # mode_machine of a simulated robot
+_TOUCH = 60  # foot_force of a foot on the ground, in the robot's own unit; ours
+_FULL = 4.1  # [V] of a full battery cell
+_MOST = 1e10  # limit of any command value; NaN fails it, too. Ours: above POSITION_STOP, and its square is finite
 _PARTS = ("q", "dq", "tau", "kp", "kd")  # of a motor's command
 _FAULT = 0x1  # motorstate of a motor with a fault
-# [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
+# [weights/m], [weights s/m], [s] ours: stiffness and damping of a soft rope, and the time to lower it
 _HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0
 
-_HOOK = 0.2  # [m] ours: above the root, of a rope that it hangs from freely
+_HOOK = 0.2  # [m] ours: hook of the rope above the root, for a robot that hangs freely
 
-LIMP, DAMPED, DRIVEN = "limp", "damped", "driven"  # what motors do: nothing, damping alone, more
+LIMP, DAMPED, DRIVEN = "limp", "damped", "driven"  # state of the motors: no torque, only damping, more
 
 
 @dataclass
 class ServedRecord:
-    """What a simulated robot was told and did, by its own clock."""
+    """The record of a simulated robot, by its own clock."""
 
     commands: int = 0
-    refused: int = 0  # commands of another size, with a wrong checksum, head or mode_machine, or that are not finite
-    # what was wrong with the first command of each kind that was refused
+    # commands of another size, with a wrong checksum, head or mode_machine, or with values that are not finite
+    refused: int = 0
+    # kind of refusal -> reason of the first one
     why: dict[str, str] = field(default_factory=dict)
     watchdog: int = 0  # times that it damped by itself
-    # [s], from when on they do what
+    # [s] start of each motor state
     changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))
-    beyond: float = 0.0  # [rad] by which a joint was outside its range at most
-    fastest: float = 0.0  # [rad/s] of a joint at most
-    outside: float = 0.0  # [rad] by which a target was outside its servo's range at most
-    asked: float = 0.0  # [share of what its motor has] that a command asked for at most
+    beyond: float = 0.0  # [rad] largest joint angle outside the range
+    fastest: float = 0.0  # [rad/s] fastest joint
+    outside: float = 0.0  # [rad] largest target outside the servo's range
+    asked: float = 0.0  # [share of the motor's torque] largest commanded
 
     def drive(self, time: float, acted: dict[str, Floats]) -> None:
-        """The motors obey ``acted`` (D,) each from ``time`` [s] on."""
+        """Record that the motors obey ``acted``, (D,) each, from ``time`` [s] on."""
         driven = acted["kp"].any() or acted["tau"].any()
         what = DRIVEN if driven else DAMPED if acted["kd"].all() else LIMP
         if what != self.changes[-1][1]:
             self.changes.append((time, what))
 
     def damped_after(self, time: float) -> float | None:
-        """[s] from ``time`` until the motors damped and did nothing else from then on; None: they do not, or did not drive then."""
+        """[s] from ``time`` until the motors only damped, to the end.
+
+        None if they do not damp at the end, or were not driven before ``time``.
+        """
         before = next((what for since, what in reversed(self.changes) if since < time), LIMP)
         since, what = self.changes[-1]
         return since - time if before == DRIVEN and what == DAMPED and since >= time else None
 
 
 class SimulatedUnitree:
-    """One robot in MuJoCo with a Unitree's motors, sensors and messages; ``end`` is its end of the wire."""
+    """One robot in MuJoCo with a Unitree's motors, sensors and messages. ``end`` is its end of the wire."""
 
     def __init__(
         self,
@@ -90,10 +94,10 @@ class SimulatedUnitree:
         lift: float = 0.0,
         seed: int = 0,
     ) -> None:
-        """The robot of the export in ``folder``, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
+        """Load the export's robot, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
 
         ``lift``: [m] above its start, where it hangs freely.
-        ``watchdog``: seconds without a command until it damps by itself.
+        ``watchdog``: [s] without a command until it damps by itself.
         """
         self.machine: Machine = machine_of(contract.joints)
         self.contract, self.end, self.faults, self.record, self._watchdog = (
@@ -113,7 +117,7 @@ class SimulatedUnitree:
             WireMessage(LAYOUTS[self.machine.package, "LowState_"]),
         )
         self.reset()
-        # the body that the rope holds: of a G1 in the air its torso
+        # the body on the rope: of a G1 in the air its torso
         self._hung = int(np.argmax(self.model.body_mass)) if lift else 1
         self._height, self._weight = float(self.data.xpos[self._hung, 2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
@@ -121,18 +125,21 @@ class SimulatedUnitree:
         self._fill()
 
     def reset(self, after: float = 0.0) -> None:
-        """Put it into its first keyframe, limp, ``after`` seconds from now, nothing under way to it: its clock and its record go on."""
+        """Put the robot into its first keyframe, limp, ``after`` [s] from now.
+
+        Messages on the way are dropped. Its clock and its record go on.
+        """
         time = self.time + after
         self._in, self._out, self._last = Line(self._rng), Line(self._rng), -math.inf
-        self.command: WireMessage | None = None  # the last one that was taken
-        self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) what the motors obey
+        self.command: WireMessage | None = None  # the last accepted one
+        self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) command that the motors obey
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         self.data.qpos[2] += self._lift
         self.data.time = time
         mujoco.mj_step1(self.model, self.data)
 
     def _make_motors(self) -> None:
-        """Torque motors in place of the scene's servos, whose damping is the motors' now."""
+        """Replace the scene's servos by torque motors. Joint damping becomes the motors' own."""
         model, joints = self.model, [self.model.joint(name).id for name in self.contract.joints]
         self._dofs, self._angles = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
         self._actuators = self._scene.actuators
@@ -149,22 +156,22 @@ class SimulatedUnitree:
 
     @property
     def tick(self) -> int:
-        """Of the state that was sent last [ms]."""
+        """Tick [ms] of the last sent state."""
         return int(self._state["tick"])
 
     @property
     def joint_pos(self) -> Floats:
-        """(D,) [rad], the truth."""
+        """True joint angles (D,) [rad]."""
         return self.data.qpos[self._angles].copy()
 
     @property
     def joint_vel(self) -> Floats:
-        """(D,) [rad/s], the truth."""
+        """True joint speeds (D,) [rad/s]."""
         return self.data.qvel[self._dofs].copy()
 
     @property
     def torque(self) -> Floats:
-        """(D,) [N m] of the last step."""
+        """Torques (D,) [N m] of the last step."""
         return self.data.actuator_force[self._actuators].copy()
 
     @property
@@ -173,7 +180,7 @@ class SimulatedUnitree:
         return float(self.data.xmat[1, 8])
 
     def step(self) -> None:
-        """Send the state, take the newest command, move on by STEP."""
+        """Send the state, take the newest command, advance by STEP."""
         if not self.faults.frozen:
             self._fill()
         if not self.faults.silent:
@@ -193,7 +200,7 @@ class SimulatedUnitree:
         self.record.fastest = max(self.record.fastest, float(np.abs(self.joint_vel).max()))
 
     def _receive(self, body: bytes) -> None:
-        """One message of the wire; it may be anything."""
+        """Handle one message of the wire; it may be anything."""
         layout = LAYOUTS[self.machine.package, "LowCmd_"]
         if len(body) == layout.size:
             self._take(WireMessage(layout, body))
@@ -205,7 +212,7 @@ class SimulatedUnitree:
         self.record.why.setdefault(kind, why)
 
     def _take(self, command: WireMessage) -> None:
-        """Obey a command from now on, if it is one."""
+        """Accept a valid command, refuse any other."""
         if self.machine.package == "unitree_go":
             kind, said, wanted = (
                 "head and level_flag",
@@ -235,7 +242,7 @@ class SimulatedUnitree:
         self._obey(acted)
 
     def _obey(self, acted: dict[str, Floats]) -> None:
-        """From now on."""
+        """Apply a command from now on."""
         self.acted, record, limits = acted, self.record, self._limits
         torque = (
             acted["tau"] + acted["kp"] * (acted["q"] - self.joint_pos) + acted["kd"] * (acted["dq"] - self.joint_vel)
@@ -248,14 +255,14 @@ class SimulatedUnitree:
         record.drive(self.time, acted)
 
     def _plugs(self) -> tuple[Any, Any]:
-        """The slot that each joint's motor is plugged into (D,), and the way that it turns: 1 or -1, of each or of all."""
+        """Slot of each joint's motor (D,), and its sign of rotation: 1 or -1, per joint or for all."""
         faults = self.faults
         slots = np.roll(self._slots, faults.joint_order) if faults.joint_order else self._slots
         turned = faults.turned_joints
         return slots, np.where([name in turned for name in self.contract.joints], -1.0, 1.0) if turned else 1.0
 
     def _move(self) -> None:
-        """The motors' law, as MuJoCo's affine actuators know it: tau + kp q + kd dq - kp q_now - kd dq_now."""
+        """Set the motors' law in MuJoCo's affine actuators: tau + kp q + kd dq - kp q_now - kd dq_now."""
         acted = self.acted
         if self.command and self.time - self._last > self._watchdog and acted["kp"].any():
             zero = np.zeros(len(acted["q"]))
@@ -268,7 +275,7 @@ class SimulatedUnitree:
         self.model.actuator_biasprm[self._actuators, :3] = law
 
     def _pull(self) -> None:
-        """The rope of the hoist: it holds a body upright at its height, softly, and gives way slowly."""
+        """Pull the hoist's rope. It holds a body upright at its height, softly, and lowers it slowly."""
         if not self.hoist:
             self._rope = max(0.0, self._rope - STEP / _LOWERING)
         data, rope, body, moves = self.data, self._rope * self._weight, self._hung, np.zeros(6)
@@ -282,7 +289,7 @@ class SimulatedUnitree:
         data.xfrc_applied[body, 3:] = rope * (upright * tilt - 0.1 * upright * turn)
 
     def _fill(self) -> None:
-        """The state message of this moment."""
+        """Fill the state message of this moment."""
         state, data, faults = self._state, self.data, self.faults
         orientation, roll = np.zeros(4), math.radians(faults.imu_tilt) / 2
         before = {part: state[NAN[part]] for part in NAN} if faults.stuck else {}
@@ -315,7 +322,7 @@ class SimulatedUnitree:
             state["crc"] = int(state["crc"]) ^ 1
 
     def _stick(self, before: dict[str, Floats]) -> None:
-        """Parts that are stuck are as they were ``before``; the encoder of a joint measures no speed either."""
+        """Set frozen parts to their values ``before``. A frozen encoder measures zero speed."""
         state, stuck = self._state, self.faults.stuck
         for part in stuck & NAN.keys():
             state[NAN[part]] = before[part]
@@ -324,13 +331,13 @@ class SimulatedUnitree:
             state[NAN[part]] = np.where(joints, values, state[NAN[part]])
 
     def _fill_own(self) -> None:
-        """What only this package's robots tell."""
+        """Fill the fields that only this package has."""
         state, faults = self._state, self.faults
         voltage = _FULL * self.machine.cells if faults.voltage is None else faults.voltage
         dead = self._in_slots([name in faults.dead_motors for name in self.contract.joints]).astype(int)
         if self.machine.package == "unitree_go":
             state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], voltage
-            state["motor_state.lost"] = state["motor_state.lost"] + dead  # no message reaches them any more
+            state["motor_state.lost"] = state["motor_state.lost"] + dead  # no message reaches them
             feet = zip(self.contract.feet, self._scene.contacts, strict=True)
             touch = {foot: (self.data.sensordata[where] > 0.0).any() for foot, where in feet}
             state["foot_force"] = [_TOUCH * touch.get(foot, False) for foot in self.machine.feet] or 0
@@ -340,7 +347,7 @@ class SimulatedUnitree:
             state["motor_state.vol"], state["motor_state.motorstate"] = voltage, dead * _FAULT
 
     def _in_slots(self, values: Any) -> Floats:
-        """Values (D,) of the joints, each at its motor's place; zero elsewhere."""
+        """Values (D,) of the joints in their motors' slots; zero elsewhere."""
         slots = np.zeros(self.machine.slots)
         slots[self._plugs()[0]] = values
         return slots
@@ -350,7 +357,7 @@ class SimulatedUnitree:
 
 
 def _outside(values: Floats, low: Floats, high: Floats) -> float:
-    """[rad] by which the one that is farthest out is outside its range; 0: none is."""
+    """[rad] Largest distance outside a range; 0 if all are inside."""
     return max(0.0, float(np.maximum(low - values, values - high).max()))
 
 
