@@ -114,7 +114,7 @@ class LeggedRobotCfg(RobotTaskCfg):
             feet_clearance: float = -2.0
             feet_height: float = -0.2
             feet_slip: float = -0.1
-            feet_air_time: float = 0.1
+            feet_air_time: float = 0.1  # [P]
             collision: float = 0.0  # of asset.penalize_contacts_on [L]
 
     class noise(RobotTaskCfg.noise):

@@ -122,7 +122,7 @@ class RobotTask(BaseTask):
         self.actuators.apply(self.actions)
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
-        """Torques (N, D) [N m] from clipped, delayed ``actions`` (N, D); the force limits are applied afterwards.
+        """Torques (N, D) [N m] from clipped, delayed ``actions`` (N, D); force limits and curve apply afterwards.
 
         It runs only in a class that overrides it, before every simulation step: the override is then the motors' law.
         Without an override the law is ``control.actuator``, by default MuJoCo's servo (envs/motors.py). This method is
@@ -515,7 +515,7 @@ class RobotTask(BaseTask):
         return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
 
     def _episode_columns(self) -> dict[str, int]:
-        """Name -> width of the attributes (N, width) that a reset clears."""
+        """State of an episode: name -> width of attributes (N, width) that a reset clears. Subclasses add theirs."""
         on, joints = self._active_scales(), self.num_actions
         sums = {"episode_sums": len(on), "episode_return": 1, "episode_steps": 1}
         before = {"last_last_actions": joints} if "action_smoothness" in on else {}

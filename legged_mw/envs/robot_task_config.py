@@ -102,8 +102,9 @@ class RobotTaskCfg(Config):
         actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
         stiffness: dict[str, Gain] = {}  # table a joint: position gain [N m/rad]
         damping: dict[str, Gain] = {}  # table a joint: passive damping; of a dc_motor its velocity gain [N m s/rad]
-        # tables a joint of a torque-speed curve: dc_motor needs it, torque and network may have it. At speed w torque
-        # is from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), within asset.effort
+        # tables a joint of a torque-speed curve: dc_motor needs it; torque, network and a law in code may have it.
+        # Torque at speed w: -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), within
+        # asset.effort
         stall_torque: dict[str, Positive] = {}  # [N m]
         no_load_speed: dict[str, Positive] = {}  # [rad/s]
         gear: dict[str, Positive] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the curve is at the joint
