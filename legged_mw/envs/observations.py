@@ -23,9 +23,8 @@ class Row(NamedTuple):
     name: str
     value: Tensor  # (N, size), a buffer that the step writes in place
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
-    mirror: str | None = (
-        None  # its mirror image: a kind of envs/mirror.py, or a group; None: not stated, so symmetry must be off
-    )
+    # its mirror image: a kind of envs/mirror.py, or a group; None: not stated, so symmetry must be off
+    mirror: str | None = None
     scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
     measured: bool = False  # it comes from a sensor of the robot, so domain_rand.observation_delay applies to it
     # For an exported policy, how a robot measures it (legged_mw/deploy/contract.py knows RobotTask's rows by name):
