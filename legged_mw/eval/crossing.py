@@ -1,4 +1,4 @@
-"""The rough part of the walking exam: does the robot walk from the middle of a tile to its edge, on each kind and level?
+"""The rough part of the walking exam: walk from the middle of a tile to its edge, on each kind and level of terrain.
 
 The robot starts near the middle of a tile with a random heading. The command is to walk ahead at 0.6 m/s.
 The terrain has the task's kinds, generated from another seed. The robot is nominal, without noise and pushes,
@@ -115,7 +115,7 @@ def _measure(kind: str) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The share of crossings, one line per kind and one column per level, then the mean shares of crossings and falls."""
+    """The share of crossings, one line per kind and one column per level, then the mean shares crossed and fallen."""
     kinds = result["kinds"]
     lines = [
         f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"

@@ -67,9 +67,9 @@ def _first_crossing(time: Array, values: Array, level: float) -> float | None:
 
 
 def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
-    """Of worlds with the same command from step ``begin`` on: the command, and mean, lowest and highest of one axis over time.
+    """The response along one axis of worlds that get the same command from step ``begin`` on.
 
-    Worlds that fall are left out.
+    Returns the command, and mean, lowest and highest velocity over time. Worlds that fall are left out.
     """
     commanded, stood = record.commands[begin:, 0, axis], np.isinf(record.fell_at)
     moved = record.signals["velocity"][begin:, stood, axis].astype(float)
@@ -153,9 +153,9 @@ def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], sec
 
 
 def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) -> dict[str, Any]:
-    """The distribution of ``values`` (S, D) for each joint, and the share of samples outside ``margin`` times the limits.
+    """The distribution of ``values`` (S, D) for each joint, and the share of samples beyond the limits.
 
-    ``low``, ``high``: the limits (D,). Infinite means no limit, and no share is computed.
+    ``low``, ``high``: the limits (D,), multiplied by ``margin``. Infinite means no limit, and no share is computed.
     """
     if not len(values):
         return {"low": [], "high": [], "edges": [], "density": [], "quantiles": [], "saturated": []}

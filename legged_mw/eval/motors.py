@@ -41,7 +41,7 @@ class MotorLimits(NamedTuple):
 
 
 def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorLimits) -> list[dict[str, Any]]:
-    """For each kind of joint: a histogram of torque and speed, the motor's envelope, and the share of time at the envelope.
+    """For each kind of joint: a histogram of torque and speed, the motor's envelope, and the share of time at it.
 
     ``kinds`` (D,): joints of the same kind share a plot and must have equal motors. Worlds that fell are left out.
     """
