@@ -108,7 +108,7 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
 
 
 def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
-    """Signal -> lowest and highest value (D,): soft position limits, speed limits (infinite if unknown), torque limits."""
+    """Signal -> (low, high), each (D,): soft position limits, speed limits (infinite if unknown), torque limits."""
     speeds = np.array(env.robot.speed_limits)
     position = torch.stack([env.soft_lower, env.soft_upper]).cpu().numpy().astype(float)
     effort = env.robot.effort_range.T

@@ -113,7 +113,7 @@ def roll_out(
 
 
 class _Actor:
-    """A policy for all worlds. The first ``alone`` worlds are a separate batch, because rounding depends on the batch size."""
+    """A policy for all worlds. The first ``alone`` worlds are a separate batch: rounding depends on the batch size."""
 
     def __init__(self, policy: Policy, worlds: int, alone: int | None) -> None:
         forget(policy)

@@ -29,7 +29,8 @@ LEVELS = 10  # of each kind of rough terrain
 SLOW = 0.1  # [m/s] slowest speed with a meaningful cost of transport
 EQUAL_DRIFT = 0.005  # [m] smaller drifts count as equal
 # Defaults: push speeds [m/s], the speed that must be survived [m/s], the measure of the marks, fixed marks
-# [m/s, m/s, rad/s]. A biped sways at each step. Its error at each time contains the sway, so its marks are of the offset.
+# [m/s, m/s, rad/s]. A biped sways at each step. Its error at each time contains the sway,
+# so its marks are of the offset.
 BIPED: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0), "push_mark": 1.0, "marks_of": "offset"}
 OTHERS: dict[str, Any] = {
     "push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0),
@@ -233,14 +234,14 @@ class ExamRules:
         return {"walks": self.walks(result), **beats, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
-        """Whether the policy walks: no falls, errors (or offsets) within the marks, all pushes at ``push_mark`` survived."""
+        """Whether the policy walks: no falls, errors (or offsets) within the marks, no fall by a push at ``push_mark``."""
         if result["falls"]:
             return False
         small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
         return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
     def beats_peer(self, result: Mapping[str, Any]) -> bool:
-        """Whether the result is as good on each figure of each peer, and better on the errors and the cost of transport."""
+        """Whether the result is as good as each peer on every figure, and better on errors and cost of transport."""
         return all(_beats(result, peer.figures) for peer in self.peers)
 
     def reached(self, result: Mapping[str, Any]) -> tuple[int, int]:
@@ -313,7 +314,7 @@ def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[A
 
 
 def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
-    """Whether the result is as good on each of the peer's figures, and better on the errors and the cost of transport."""
+    """Whether the result is as good as the peer on every figure, and better on errors and cost of transport."""
     if result["falls"] > peer["falls"]:
         return False
     better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))

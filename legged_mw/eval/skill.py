@@ -104,7 +104,7 @@ class Skill(ABC):
 
     @abstractmethod
     def starts(self, robot: ExamRobot, count: int) -> Starts | None:
-        """Start states qpos (count, nq) and qvel (count, nv), equal at every call. None: the start of the task's episodes."""
+        """Start states qpos (count, nq) and qvel (count, nv), equal at every call. None: as the task's episodes."""
 
     @abstractmethod
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
