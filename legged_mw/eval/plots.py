@@ -228,9 +228,9 @@ def _percent(share: float) -> str:
 
 
 def _heat_maps(columns: Columns, rules: ExamRules) -> list[PlotPanel]:
-    """Heat maps of three errors over two grids. The scale of an error ends at its largest value or three times its mark.
+    """Heat maps of three errors over two grids. An error's scale ends at its largest value, at most three times its mark.
 
-    If the marks are of offsets, the errors have no mark: no line on the scale, and no upper bound.
+    If the marks are of offsets, the errors have no mark: the scale has no line and may be longer.
     """
     panels, strict = [], rules.marks_of == "error"
     marks = rules.marks if strict else [3 * mark for mark in rules.marks]

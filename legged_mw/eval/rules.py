@@ -234,7 +234,7 @@ class ExamRules:
         return {"walks": self.walks(result), **beats, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
-        """Whether the policy walks: no falls, errors (or offsets) within the marks, no fall by a push at ``push_mark``."""
+        """Whether the policy walks: no falls, errors (or offsets) within the marks, all pushes of the mark survived."""
         if result["falls"]:
             return False
         small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
