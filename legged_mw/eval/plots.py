@@ -228,7 +228,7 @@ def _percent(share: float) -> str:
 
 
 def _heat_maps(columns: Columns, rules: ExamRules) -> list[PlotPanel]:
-    """Heat maps of three errors over two grids. An error's scale ends at its largest value, at most three times its mark.
+    """Heat maps of three errors over two grids. A scale ends at the largest error, at most at three times its mark.
 
     If the marks are of offsets, the errors have no mark: the scale has no line and may be longer.
     """

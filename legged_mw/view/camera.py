@@ -1,4 +1,4 @@
-"""Moves an `MjvCamera`: follow a robot, stay behind it, or show all robots. On hills the camera rises to keep the view."""
+"""Moves an `MjvCamera`: follow a robot, stay behind it, or show all robots. It looks over hills."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)

@@ -77,7 +77,7 @@ class Pilot:
     def __init__(
         self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}
     ) -> None:
-        """``only``: available action -> another description or ""; empty: all actions. Without "own" nothing is driven."""
+        """``only``: available action -> new description or ""; empty: all actions. Without "own" there is no driving."""
         self.table, self.num_worlds = tuple(table), num_worlds
         self.low, self.high, self.default = (
             np.array([getattr(command, end) for command in table], dtype=np.float64)
@@ -189,7 +189,7 @@ class Pilot:
                 self._step(*_STEP[action])
 
     def _step(self, name: str, sign: int) -> None:
-        """Change a command by one key press: a fifth of the distance from the default to the farther end of the range."""
+        """Change a command by one key press: a fifth of the span from the default to the farther end of its range."""
         columns = [i for i, each in enumerate(self.table) if (each.name == name if name else each.name not in VELOCITY)]
         if self.table and not columns:
             self.message = (

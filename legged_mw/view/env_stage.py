@@ -1,4 +1,4 @@
-"""The training environment with a policy as a stage. The only file of `view/` that imports torch and the environment."""
+"""The training environment with a policy as a stage. Only this file of `view/` imports torch and the environment."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from legged_mw.view.stage import BoolArray, FloatArray
 
 
 class EnvStage:
-    """The robots of a task under `policy`; see `stage.Stage`. `command_table`: the trained ranges; by default the task's.
+    """The robots of a task under `policy`; see `stage.Stage`. `command_table`: with the trained ranges; None: the task's.
 
     The environment's step may be a recorded graph, so a pilot's changes are written into its buffers between two steps.
     The policy must see a new command in the same step, so the observation rows "commands" and "gait_clock" are updated.

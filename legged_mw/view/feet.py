@@ -55,7 +55,7 @@ def patch(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int], radi
 
 
 def lowest_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> FloatArray:
-    """Points (P, 3) [m] of a geom that include its lowest one. For a box, and for shapes drawn as a box, its corners."""
+    """Points (P, 3) [m] of a geom that include its lowest one: corners, for a box and other kinds of geom."""
     centre, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
     kind, down = model.geom_type[geom], np.array([0.0, 0.0, -1.0])
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:

@@ -1,4 +1,4 @@
-"""`play --follow`: reload the policy when its training run writes a newer one. Reads files, not tensors."""
+"""`play --follow`: reload the policy when its training run writes a newer one. Only watches files; `load` reads them."""
 
 from __future__ import annotations
 
