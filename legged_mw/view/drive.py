@@ -77,7 +77,7 @@ class Pilot:
     def __init__(
         self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}
     ) -> None:
-        """``only``: available action -> new description or ""; empty: all actions. Without "own" there is no driving."""
+        """``only``: available action -> new description or ""; empty: all. Without "own" there is no driving."""
         self.table, self.num_worlds = tuple(table), num_worlds
         self.low, self.high, self.default = (
             np.array([getattr(command, end) for command in table], dtype=np.float64)

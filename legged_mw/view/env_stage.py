@@ -24,7 +24,9 @@ from legged_mw.view.stage import BoolArray, FloatArray
 
 
 class EnvStage:
-    """The robots of a task under `policy`; see `stage.Stage`. `command_table`: with the trained ranges; None: the task's.
+    """The robots of a task under `policy`; see `stage.Stage`.
+
+    `command_table`: the commands with their trained ranges; by default those of the task.
 
     The environment's step may be a recorded graph, so a pilot's changes are written into its buffers between two steps.
     The policy must see a new command in the same step, so the observation rows "commands" and "gait_clock" are updated.

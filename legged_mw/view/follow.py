@@ -1,4 +1,4 @@
-"""`play --follow`: reload the policy when its training run writes a newer one. Only watches files; `load` reads them."""
+"""`play --follow`: reload the policy when its training run writes a newer one. Independent of torch."""
 
 from __future__ import annotations
 

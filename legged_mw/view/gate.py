@@ -91,7 +91,7 @@ class Gate:
         return found[1] if found else ""
 
     def greeting(self, target: str) -> dict[str, str]:
-        """Headers for a first visit with the right token: set a cookie and remove the token from the address. Else empty."""
+        """Headers for a first visit with the right token: set a cookie, drop the token from the address. Else empty."""
         if not self.token or target.partition("?")[0] != "/" or not self._shown(self.asked(target)):
             return {}
         return {"Location": "/", "Set-Cookie": f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"}

@@ -132,7 +132,7 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
 
 
 def _probe_window() -> None:
-    """Open and close a hidden window as a test. If that fails, `launch_passive` would wait forever for a dead thread."""
+    """Open and close a hidden window as a test. If that fails, `launch_passive` would wait forever."""
     opened: list[bool] = []
     # on a separate thread: GLX cannot become current on a thread where an offscreen renderer holds an EGL context
     thread = threading.Thread(target=lambda: opened.append(_can_open_window()))

@@ -30,7 +30,10 @@ BUTTONS = (  # rows of (action, label)
 
 
 class Curves:
-    """Velocity and command of the followed robot over the last seconds. Thread-safe: `rows` is replaced, not modified."""
+    """Velocity and command of the followed robot over the last seconds.
+
+    Any thread may read `rows`: it is replaced, never modified.
+    """
 
     def __init__(self, commands: int) -> None:
         self.rows = np.zeros((0, 4 + commands))  # time, velocity (3,), command (C,)

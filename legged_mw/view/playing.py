@@ -101,9 +101,9 @@ def parse(description: str | None) -> argparse.Namespace:
 def prepare(
     source: PolicySource, trained: LoadedTask, args: argparse.Namespace
 ) -> tuple[LoadedTask, tuple[Command, ...]]:
-    """The trained task with the overrides of playing, then those of the user; and the commands with their trained ranges.
+    """Prepare a task for playing: apply the overrides of playing, then those of the user. Print the changes.
 
-    Prints the changes.
+    Returns the task, and the commands with their trained ranges.
     """
     task = copy.deepcopy(trained)
     config = task.to_dict()
@@ -129,7 +129,7 @@ def prepare(
 
 
 def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
-    """Overrides for a terrain that draws fast: few levels, one column and one robot per kind, the most frequent kind first."""
+    """Overrides for a terrain that draws fast: few levels, one column and one robot per kind, frequent kinds first."""
     terrain = task.to_dict()["terrain"]
     shares = terrain.get("terrain_proportions", {})
     kinds = sorted((kind for kind in shares if shares[kind] > 0), key=lambda kind: -shares[kind])
@@ -141,7 +141,7 @@ def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
         "terrain.num_cols": len(kinds),
         "terrain.border_size": BORDER,
         "terrain.terrain_proportions": dict.fromkeys(kinds, 1.0),
-        "terrain.curriculum": False,  # any level, drawn at each reset; else, where that is asked for, from the first one on
+        "terrain.curriculum": False,  # each reset draws a random level; with the curriculum on, from the first level up
         "terrain.max_init_terrain_level": 0,
     }
 
