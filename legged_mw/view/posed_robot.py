@@ -92,7 +92,7 @@ class PosedRobots:
         return data
 
     def patches(self, contacts: ArrayLike) -> list[Patch]:
-        """The contact patches of the feet in contact. `contacts` (N, G) marks geoms: the first G with a contact sensor."""
+        """The patches of the feet in contact. `contacts`: mask (N, G) of the first G geoms with a contact sensor."""
         touching = np.asarray(contacts, dtype=bool)[: self.count]
         if len(touching) < self.count or touching.shape[1] > len(self.feet):
             return []  # the model has fewer contact sensors
@@ -117,7 +117,7 @@ class PosedRobots:
         )
 
     def _measure(self) -> tuple[float, float, float]:
-        """Extent of a robot's visuals and feet [m]: largest distance from its base, top above it, lowest point below it."""
+        """Extent of a robot's visuals and feet from its base [m]: largest distance, height above, depth below."""
         model = self.model
         robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.base]
         seen = {*map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))), *self._feet[0]}
@@ -138,7 +138,7 @@ def boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: ArrayLike) -> tuple
 def many_robots(
     spec: mujoco.MjSpec, single: mujoco.MjModel, count: int
 ) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:
-    """A model for drawing with `count` copies of the robot of `spec`. Nothing collides; one robot has lights and cameras.
+    """A model for drawing: `count` copies of the robot of `spec`. Nothing collides; one copy has lights and cameras.
 
     Also returns the base of each copy, and for each copy the geoms with a contact sensor, in the order of the sensors.
     """

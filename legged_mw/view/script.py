@@ -2,8 +2,8 @@
 
 commands:
   - {time: 0, command: [0.5, 0, 0]}      # in the order of the task's commands, held until the next one
-    - {time: 3, command: {lin_vel_x: 1.0, base_height: 0.25}}    # or by name; others get their defaults
-    - {time: 6, push: [0, 1.5]}            # [m/s] jump of the horizontal velocity, world frame
+  - {time: 3, command: {lin_vel_x: 1.0, base_height: 0.25}}    # or by name; others get their defaults
+  - {time: 6, push: [0, 1.5]}            # [m/s] jump of the horizontal velocity, world frame
   - {time: 9, reset: true}
 """
 
@@ -100,7 +100,7 @@ def _entry(item: Any, where: str, table: Sequence[Command]) -> ScriptEntry:
 
 
 def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
-    """Values (C,) from a list in the order of the table, or from a mapping by name. Missing commands get their defaults.
+    """Values (C,) from a list in the order of the table, or from a mapping by name. Others get their defaults.
 
     A list has all commands, or vx, vy and yaw rate.
     """

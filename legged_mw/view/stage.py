@@ -27,7 +27,7 @@ class ViewError(UserError, RuntimeError):
 
 
 class Stage(Protocol):
-    """N robots in N separate worlds, with C commands. A stage with C = 0 cannot be driven. Returned arrays are copies."""
+    """N robots in N separate worlds, with C commands. With C = 0 it cannot be driven. Returned arrays are copies."""
 
     spec: mujoco.MjSpec  # one robot with its scene, for drawing
     num_worlds: int

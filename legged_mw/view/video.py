@@ -25,7 +25,7 @@ DITHER = "dither=bayer:bayer_scale=4:diff_mode=rectangle"  # constant where the 
 
 
 class VideoWriter:
-    """Writes an MP4 (H.264 that browsers play) or a GIF, by the file's suffix. The file appears at `close`, when complete.
+    """Writes an MP4 (H.264 that browsers play) or a GIF, by the file's suffix. The file appears at `close`.
 
     A GIF has one palette for all frames, so the frames stay in memory until `close`.
     """
