@@ -61,7 +61,7 @@ def show_task(task: LoadedTask, image: Path | None) -> None:
 
 
 def show(env: RobotTask, title: str, image: Path | None, found: Draft | None = None, rough: bool = False) -> None:
-    """Print the page and draw the picture. ``found``: the draft, to list its guesses. ``rough``: capacity for rough terrain."""
+    """Print the page and draw the picture. ``found``: a draft, to list its guesses. ``rough``: on rough terrain."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
     health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation, rough)
     print(page(health, title, found.guessed, found.notes) if found else page(health, title), flush=True)

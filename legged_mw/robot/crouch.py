@@ -50,7 +50,7 @@ def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> 
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
-    """Weights (D,) of a biped's pose reward: near 0 for hip and knee, small for the ankle, large for all other joints."""
+    """Weights (D,) of a biped's pose reward: smallest for hip and knee, small for the ankle, large for all others."""
     model, data = robot.physics, posed(robot.physics, pose)
     weights = [HELD] * len(robot.joint_names)
     for foot in feet:

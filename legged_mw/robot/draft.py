@@ -196,7 +196,7 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
-    """``numbers`` (D,) as a short table: a key per family of joints or per joint; all others get the most frequent value."""
+    """``numbers`` (D,) as a short table: the most frequent for all, other values by family or name of a joint."""
     common = Counter(numbers).most_common(1)[0][0]
     short, exact = {"": common}, dict(zip(names, numbers, strict=True))
     for name, number in exact.items():

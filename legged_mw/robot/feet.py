@@ -29,7 +29,10 @@ class Foot(NamedTuple):
 
 
 def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
-    """The feet in the order of the file, for the robot at ``qpos`` (7 + D,). Raises ModelError if no end of a limb collides."""
+    """The feet in the order of the file, for the robot at ``qpos`` (7 + D,).
+
+    Raises ModelError if no end of a limb collides.
+    """
     model, parents = robot.physics, {*robot.physics.body_parentid[1:]}
     colliding = [g for g in range(robot.ground_geoms().stop, model.ngeom) if model.geom_conaffinity[g]]
     names = [model.geom(g).name for g in colliding if model.geom_bodyid[g] not in parents]
@@ -54,7 +57,10 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
 
 
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
-    """The sole of a body: its lowest geom, and geoms of the same type at about that height. ``low``: geom -> z [m, world]."""
+    """The sole of a body: its lowest geom, and geoms of that type at about that height.
+
+    ``low``: geom -> z of its lowest point [m, world frame].
+    """
     lowest = min(low, key=lambda geom: low[geom])
     return [g for g, z in low.items() if z <= low[lowest] + _SOLE and model.geom_type[g] == model.geom_type[lowest]]
 
