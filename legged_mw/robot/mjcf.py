@@ -111,7 +111,7 @@ class XmlSource:
         return root
 
     def _size(self, element: Element) -> float:
-        """The number of elements that MuJoCo creates for this one. Cells of height fields and textures count in part."""
+        """The number of elements that MuJoCo creates for this one. A cell of a height field or texture is a share."""
         size = 1.0 + (self._largest if element.tag in ("include", "attach") else 0.0)
         for sides in (("nrow", "ncol"), ("width", "height")):
             size += math.prod(max(_numbers(element.get(side, "")), default=0.0) for side in sides) * _ELEMENTS / _CELLS
@@ -198,7 +198,7 @@ def write_archive(file: Path, text: str) -> None:
 
 
 def _text(file: Path) -> str:
-    """The text of an MJCF, URDF or MJZ. Raises ValueError for a large file, or an MJZ with more than one model."""
+    """The text of an MJCF, URDF or MJZ. Raises ValueError for a large file, or an MJZ with other contents."""
     _check_size(file.name, file.stat().st_size)
     if file.suffix != ARCHIVE:
         return _without_comments(file.read_text(encoding="utf-8", errors="replace"))
@@ -223,7 +223,7 @@ def _check_size(name: str, size: int) -> None:
 
 
 def _without_comments(text: str) -> str:
-    """``text`` without comments and <?xml ?>, with equal line numbers. MuJoCo accepts more forms of both than a parser."""
+    """``text`` without comments and <?xml ?>, with equal line numbers. MuJoCo accepts more forms of both than expat."""
     if text.count("<!--") + text.count("<?xml") > _ELEMENTS:
         raise ValueError(f"it has more than {_ELEMENTS} comments")
     found = r"<!--.*?(?:-->|\Z)|<\?xml\s[^<>]*>"

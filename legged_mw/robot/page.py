@@ -127,7 +127,7 @@ def _those(which: Sequence[Joint]) -> str:
 
 
 def faults(health: RobotNumbers) -> list[str]:
-    """Faults that no training can compensate, one line each: the fault, its place, and the config field that fixes it."""
+    """Faults that no training can compensate, one line each: the fault, its place, the config field that fixes it."""
     dt, joints, lines = health.dt, health.joints, []
     if bad := [joint for joint in joints if joint.verdict(dt, health.implicit) == "unstable"]:
         lines.append(
@@ -173,9 +173,9 @@ def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
 
 
 def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
-    """Faults that prevent a task from training, and doubtful numbers. A fault is a rule that ends every episode at once, or
-    gains that no training can compensate.
+    """Faults that prevent a task from learning, and doubtful numbers.
 
+    A fault is a rule that ends every episode at once, or gains that no training can compensate.
     The random generators are restored. A failure of this check is not an error.
     """
     if not this_rank().leads:

@@ -91,7 +91,7 @@ class _Picture:
         self._renderer.close()
 
     def view(self, name: str, azimuth: float, elevation: float, title: str) -> Frame:
-        """The robot from one side, with joint names: in the second view those on the near side, in the first the others."""
+        """The robot from one side, with joint names: of the near side in the second view, the others in the first."""
         camera, model = mujoco.MjvCamera(), self.posed.model
         camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
         camera.lookat[:], camera.distance = (

@@ -80,7 +80,7 @@ def _leads_elsewhere(joint: Element) -> bool:
 
 
 def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
-    """Drop visuals of zero size, because MuJoCo does not compile them. Raises ModelError for a collider of zero size."""
+    """Drop visuals of size zero, which MuJoCo does not compile. Raises ModelError for a collider of size zero."""
     left_out: list[str] = []
     for link in robot.findall("link"):
         for part in [part for part in [*link.findall("visual"), *link.findall("collision")] if _has_no_size(part)]:

@@ -75,7 +75,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:
-    """If the file computes all inertias from geoms, delete its explicit inertias, so that visuals can be dropped later."""
+    """Delete explicit inertias if the file computes all inertias from geoms. Then visuals can be dropped later."""
     kinds = mujoco.mjtInertiaFromGeom
     if spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
         spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
@@ -215,7 +215,7 @@ def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def _forget_defaults(spec: mujoco.MjSpec) -> None:
-    """Reset the main defaults. The file's elements already have them, and elements added later need MuJoCo's defaults."""
+    """Reset the main defaults. The file's elements already have them; elements added later need MuJoCo's defaults."""
     fresh = mujoco.MjSpec().default
     for kind, names in _ADDED.items():
         for name in names.split():
