@@ -43,9 +43,8 @@ OVERRIDES: dict[str, Any] = {
     "init_state.pos_xy_range": 0.3,
     "init_state.yaw_range": math.pi,
 }
-SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {
-    "domain_rand.enable"
-}  # config fields that the user may not override
+# config fields that the user may not override
+SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}
 
 
 def prepare(task: LoadedTask, repeats: int = REPEATS) -> None:

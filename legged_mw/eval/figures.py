@@ -40,8 +40,8 @@ def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[f
 def step_response(time: Array, measured: Array, start: float, target: float) -> dict[str, float | None]:
     """The response of ``measured`` (T,) to a command that steps from ``start`` to ``target`` at time 0.
 
-    ``rise_time``: from 10 to 90 % of the step [s]. ``overshoot``: beyond the target, as a share of the step. Both are None
-    if ``measured`` does not begin near the start or does not settle near the target.
+    ``rise_time``: from 10 to 90 % of the step [s]. ``overshoot``: beyond the target, as a share of the step.
+    Both are None if ``measured`` does not begin near the start or does not settle near the target.
     ``left``: mean difference to the target in the last half second, in the unit of ``measured``.
     """
     way = (measured - start) / (target - start)

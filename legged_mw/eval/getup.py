@@ -55,9 +55,8 @@ class GetupExam(Skill):
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         hold, stay, limit = (round(seconds / robot.dt) for seconds in (HOLD, STAY, self.within))
         held = _lasting(standing(robot, recording), hold)  # (T - hold + 1, N): it stands for HOLD from this step on
-        up_at = np.where(
-            held.any(axis=0), held.argmax(axis=0), len(held)
-        )  # (N,) first such step; the end if there is none
+        # (N,) first such step; the end if there is none
+        up_at = np.where(held.any(axis=0), held.argmax(axis=0), len(held))
         up = up_at <= limit
         still = held[np.minimum(up_at + stay, len(held) - 1), np.arange(held.shape[1])] & up
         until = np.arange(len(recording.qpos))[:, None] <= up_at  # (T, N): still getting up

@@ -18,10 +18,8 @@ from legged_mw.skills.clip import rotate
 
 SEED, OFFSET = 30_000, 0.05  # of the starts: each joint angle is offset by U(-OFFSET, OFFSET) [rad] [ours]
 WITHIN, HOLD = 3.0, 5.0  # [s] time limit for rising, time to hold [ours]
-TILT, HIGH = (
-    30.0,
-    0.8,
-)  # up: [deg] largest angle from the root's x axis to the vertical, least share of the height [ours]
+# The robot is up: [deg] largest angle from the root's x axis to the vertical, least share of the height [ours].
+TILT, HIGH = 30.0, 0.8
 
 
 @dataclass(frozen=True)

@@ -75,9 +75,8 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
     parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
     settled, until = round(rules.SETTLING / env.dt), round(rules.PUSH_UNTIL / env.dt)
     held, axes, first = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
-    straight = int(np.argmin(np.abs(axes["vy"]))) * len(
-        axes["vx"]
-    )  # first index of the grid's row with vy nearest to 0
+    # first index of the grid's row with vy nearest to 0
+    straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])
     ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
     return {
         "joint_names": list(env.robot.joint_names),

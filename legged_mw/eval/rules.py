@@ -109,8 +109,8 @@ class ExamRules:
     ) -> ExamRules:
         """The rules from the config section ``exam`` or from ``to_mapping``. Missing fields get defaults.
 
-        ``trained``: command -> (lowest, highest), for commands without a range in ``given``. ``feet``: number of feet; a robot
-        with two gets the easier defaults of a biped. Raises ConfigError.
+        ``trained``: command -> (lowest, highest), for commands without a range in ``given``.
+        ``feet``: number of feet; a robot with two gets the easier defaults of a biped. Raises ConfigError.
         """
         said = {name: value for name, value in given.items() if value or name not in OTHERS}
         given = {"ranges": {}, "peer": "", **(BIPED if feet == 2 else OTHERS), **said}
@@ -201,8 +201,8 @@ class ExamRules:
         """The exam's result from samples of N worlds, taken before each of T control steps of ``dt`` [s].
 
         ``signals``: velocity (T, N, 3) [m/s, m/s, rad/s]; position (T, N, 2) [m]; power (T, N) [W], the sum of
-        |torque * joint speed|; joint_speed (T, N) [rad/s], the mean over the joints; estimate (T, N, 2) [m/s], for a policy
-        with a velocity estimator.
+        |torque * joint speed|; joint_speed (T, N) [rad/s], the mean over the joints; estimate (T, N, 2) [m/s], only for a
+        policy with a velocity estimator.
         ``last_position`` (N, 2) [m]: after the last step. ``fell_at`` (N,): control step of the first fall, or inf.
         ``mass`` [kg].
         """

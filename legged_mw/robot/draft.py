@@ -33,7 +33,7 @@ from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import import_task
 
 LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
-# factors on the suggested gains; no vendor publishes gains above twice the suggested ones [ours]
+# factors on the suggested gains; published gains are at most twice the suggested ones [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 

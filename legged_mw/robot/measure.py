@@ -220,7 +220,8 @@ def _highest(robot: RobotModel, qpos: FloatArray) -> float:
 def mass_matrices(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
     """Mass matrices (V, V) with armature, root upright, for four poses.
 
-    "default" is ``pose`` (D,). In "low", "middle" and "high" all joints are there in their range.
+    "default" is ``pose`` (D,). "low", "middle" and "high" have all joints at that point of their ranges; the range of a
+    joint without limits is ``pose`` +- 1 rad.
     """
     limited = robot.physics.jnt_limited[1:] > 0
     low, high = robot.joint_range.T

@@ -62,7 +62,7 @@ class Gate:
     def refusal(self, target: str, header: Callable[[str], list[str]]) -> str:
         """The reason to refuse a request for ``target`` (path and query); empty to accept it.
 
-        ``header``: name -> all values. DNS rebinding shows in Host; a page of another site shows in Origin or Sec-Fetch-Site.
+        ``header``: name -> all values. DNS rebinding shows in Host; a page of another site in Origin or Sec-Fetch-Site.
         The browser sets these three headers, and no page can change them.
         """
         host, origin, path = header("Host"), header("Origin"), target.partition("?")[0]

@@ -43,9 +43,8 @@ class NativeViewer:
         self._threads = set(threading.enumerate()) - before
         self._texts: list[Text] = []  # replaced, never modified: another thread reads it
         self._ended = threading.Event()
-        self._writer = threading.Thread(
-            target=self._write, daemon=True
-        )  # a daemon, because a closed window may block it forever
+        # a daemon, because a closed window may block it forever
+        self._writer = threading.Thread(target=self._write, daemon=True)
         with self._handle.lock():
             show_groups(self._handle.opt)
             self._camera = RobotCamera(self._handle.cam, self.robots, by_hand=True)

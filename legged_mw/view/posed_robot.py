@@ -36,8 +36,8 @@ class PosedRobots:
     """All robots of one picture as one `model` with its `data`, without dynamics.
 
     The followed robot is always the first one in the model, so lights and cameras follow it and a camera can track its
-    body `base`. Robots are shifted by `offsets` (N, 3) [m] to stand side by side; on rough terrain the offsets are zero.
-    `radius`, `top` and `bottom` [m] are measured in the model's first pose.
+    body `base`. `offsets` (N, 3) [m] place the robots side by side; on rough terrain they are zero. `radius`, `top` and
+    `bottom` [m] are measured in the model's first pose.
     """
 
     def __init__(self, spec: mujoco.MjSpec, count: int = 1) -> None:
