@@ -91,16 +91,16 @@ def require_exam(task: LoadedTask) -> Exam:
 
 
 def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner | None:
-    """The exam for a policy that trains in ``env``; None if the task has none.
+    """The exam during the training in ``env``; None if the task has none.
 
-    None, too, and a line that says why, if the policy could not read the exam's nominal world.
+    Also None, with a printed reason, if the policy cannot read the observations of the exam's nominal world.
     """
     if not (kind := find_exam(task)):
         return None
     examine = kind.in_training(task, env.device, eager)
     here, there = env.get_observations(), examine.env.get_observations()
     for group in task.train.obs_groups.actor:
-        # a group that does not exist is the learner's to refuse
+        # the learner reports an unknown group
         if group in here and here[group].shape[1] != there[group].shape[1]:
             sizes = f"{there[group].shape[1]} values in the exam's nominal world and {here[group].shape[1]} in training"
             print(f"no exam during training: the actor's observation group '{group}' has {sizes}")

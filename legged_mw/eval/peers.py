@@ -19,7 +19,7 @@ class Peer(NamedTuple):
     """A published policy: its figures, and the rules of its measurement."""
 
     name: str
-    asked: dict[str, Any]  # fields of ExamRules that its figures depend on
+    asked: dict[str, Any]  # values of the ExamRules fields that affect its figures
     figures: dict[str, Any]  # the known keys of an exam's result
     own_speed: bool = False  # pushes and cost of transport at half its own top speed, whatever the ranges
 

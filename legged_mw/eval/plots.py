@@ -155,7 +155,7 @@ def _inline(svg: str) -> str:
 
 
 def write_png(section: Section, path: Path) -> None:
-    """The section's panels as one picture, on the light background."""
+    """Write the section's panels as one PNG on a light background."""
     across = min(section.across, len(section.panels))
     rows = math.ceil(len(section.panels) / across)
     width, height = section.panels[0].width, max(panel.height for panel in section.panels)
@@ -174,7 +174,7 @@ def _of(name: str, columns: Columns) -> str:
 
 
 def _array(values: Any) -> np.ndarray:
-    """Nested lists with None as an array with NaN."""
+    """Convert nested lists to an array, None to NaN."""
     return np.array(values, dtype=float)
 
 

@@ -58,7 +58,7 @@ class ExamRobot(NamedTuple):
     """The robot of an exam."""
 
     model: mujoco.MjModel  # model of the simulation, with the gravity of the exam's ground
-    home: Floats  # (nq,) start state of an episode, joints in the default pose
+    home: Floats  # (nq,) qpos at the start of an episode, joints in the default pose
     dt: float  # [s] a control step
     motion: ReferenceMotion | None = None
 
@@ -69,7 +69,7 @@ class Recording(NamedTuple):
     qpos: Floats  # (T, N, nq) position [m, world frame], quaternion wxyz, joint angles [rad]
     qvel: Floats  # (T, N, nv)
     torque: Floats  # (T, N, D) [N m], one simulation step old
-    ended_at: Floats  # (N,) control step of the episode's end, or inf; later samples are of another episode
+    ended_at: Floats  # (N,) control step of the first end of an episode, or inf; later samples are of another one
 
 
 class Measure(NamedTuple):

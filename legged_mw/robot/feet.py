@@ -66,7 +66,7 @@ def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
 
 
 def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
-    """The foot with these geoms of ``body``, with a name."""
+    """The foot with these geoms of ``body``, named by its geom or body."""
     names = tuple(robot.physics.geom(geom).name for geom in geoms)
     # also bodies that are fused in the simulated model
     parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]

@@ -26,7 +26,7 @@ import numpy as np
 
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
 _INSIDE = "model.xml"
-MOST_BYTES = 64 << 20  # of one file: ten times the largest known robots with their meshes inside
+MOST_BYTES = 64 << 20  # of one file: ten times the largest known robots with inline meshes
 # Largest mass of a body [kg]; length [m] or inertia [kg m^2]; gravity [m/s^2], which is 981 for a file in cm.
 HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3
 # Most elements, with all copies; cells of height fields and textures; depth of nesting.
@@ -245,7 +245,7 @@ def _check_regular(path: str, where: str) -> None:
 def _numbers(value: str) -> list[float]:
     """The numbers in an attribute; empty if it has anything else."""
     try:
-        return [float(part) for part in value.split(None, 9)]  # the checked attributes have fewer
+        return [float(part) for part in value.split(None, 9)]  # the checked attributes have fewer numbers
     except ValueError:
         return []
 

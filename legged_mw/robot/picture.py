@@ -113,7 +113,7 @@ class _Picture:
                 _line(frame, self._project(label.place, camera), self._project(end, camera), rgb, wide=3)
         return frame
 
-    # ---- what is drawn ----
+    # ---- robot ----
 
     def _paint(self) -> None:
         """Paint colliders orange and other parts of the robot half transparent. Hide everything else."""

@@ -23,8 +23,8 @@ FOLLOW_ALL = 0.04  # the same in mode "all": slow, because robots enter and leav
 REACH = 14.0  # [robot radius] mode "all" shows the robots within this distance of the followed one
 REACH_HILLS = 24.0  # the same on hills, where each robot starts on a separate tile
 TURN = 0.08  # filter: share of the angle to the heading per frame
-# On hills the feet must be visible over a rise: steepest elevation [deg]; clearance of the line of sight and depth of
-# the feet below the base [robot radius].
+# On hills the feet must be visible over a rise: steepest elevation [deg],
+# clearance of the line of sight and depth of the feet below the base [robot radius].
 STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6
 LIFT = 0.06  # filter: share of the angle to this elevation per frame
 JUMP = 3.0  # [robot radius] a larger move of the base in one frame is a reset, and the camera jumps too

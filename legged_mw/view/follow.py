@@ -14,9 +14,9 @@ _SECONDS = 2.0  # between two checks of the folder
 
 
 class Newest:
-    """A call at each step loads the newest policy of a run by ``load``, which returns its iteration, and describes it.
+    """Reloads the newest policy of a run; call it at each step. ``load`` reads a file and returns its iteration.
 
-    It ends the program when the parent process has ended: a viewer must not outlive a killed training run.
+    It ends the program if the parent process has ended: a viewer must not outlive a killed training run.
     """
 
     def __init__(self, folder: Path, load: Callable[[Path], int], shown: Path) -> None:

@@ -78,7 +78,7 @@ class NativeViewer:
         self._ended.set()
         self._writer.join(timeout=CLOSE_SECONDS)
         self._handle.close()
-        for thread in self._threads:  # a process that ends while the window still closes crashes in its OpenGL driver
+        for thread in self._threads:  # the OpenGL driver crashes if the process ends before the window has closed
             thread.join(timeout=CLOSE_SECONDS)
 
     def _write(self) -> None:

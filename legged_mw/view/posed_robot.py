@@ -23,7 +23,7 @@ SPACING = 3.0  # [robot radius] distance between robots side by side
 
 
 class Placement(NamedTuple):
-    """Where a robot is in the picture."""
+    """The place and the extent of a robot in the picture."""
 
     position: FloatArray  # (3,) [m] of the base
     heading: float  # [rad] of the base's x axis, about the vertical
@@ -129,7 +129,7 @@ class PosedRobots:
 
 
 def boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Centres and half edges (G, 3) [m] of the upright boxes around ``geoms``."""
+    """Centres and half edges (G, 3) [m] of the axis-aligned boxes around ``geoms``, world frame."""
     rotation, box = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms]
     centres = data.geom_xpos[geoms] + (rotation @ box[:, :3, None])[..., 0]
     return centres, (np.abs(rotation) @ box[:, 3:, None])[..., 0]
