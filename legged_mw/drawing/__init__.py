@@ -1,1 +1,1 @@
-"""How a robot and its ground look: sky, light, camera, relief. A tool: nothing here is stepped."""
+"""The looks of a robot and its ground: sky, light, camera, terrain colours. Not part of the simulation."""

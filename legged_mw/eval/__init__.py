@@ -1,1 +1,1 @@
-"""Judging a policy: the walking exam."""
+"""Grade policies: the walking exam, the skill exams and the report."""

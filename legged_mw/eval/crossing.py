@@ -1,7 +1,8 @@
-"""The exam's rough part: on every kind and level of ground, does the robot get from the middle of a tile to its edge?
+"""The rough part of the walking exam: walk from the middle of a tile to its edge, on each kind and level of terrain.
 
-The command is to walk ahead at 0.6 m/s, from a random place near the middle and in a random direction; the ground is the task's
-own kinds, built with another seed. Nominal robot, no noise, no pushes: the same overrides as the walking exam's.
+The robot starts near the middle of a tile with a random heading. The command is to walk ahead at 0.6 m/s.
+The terrain has the task's kinds, generated from another seed. The robot is nominal, without noise and pushes,
+by the same overrides as the walking exam.
 """
 
 from __future__ import annotations
@@ -22,17 +23,19 @@ from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
-# [m/s] commanded; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
+# Commanded speed [m/s] and time limit [s]. The robot can walk 9 m in that time; a corner is 5.7 m away.
 SPEED, SECONDS = 0.6, 15.0
-TILES, REPEATS = 2, 5  # tiles of each level, of a slope one goes up and one down; robots on each tile
+# tiles per kind and level (of a slope, one goes up and one goes down); robots per tile
+TILES, REPEATS = 2, 5
 
 OVERRIDES: dict[str, Any] = {
-    # a trunk in a step is a fall
+    # keep the task's limit on the base's height: a trunk inside a step is a fall
     **{path: value for path, value in exam.OVERRIDES.items() if path != "termination.min_base_height"},
     "terrain.mesh_type": "heightfield",
     "terrain.curriculum": False,
     "terrain.num_rows": LEVELS,
-    "terrain.tile_size": 8.0,  # [m]; what is to be crossed is the same for every task, and so is how steep a step can be:
+    # the same distance and the same steepest step for every task:
+    "terrain.tile_size": 8.0,  # [m]
     "terrain.horizontal_scale": 0.05,  # [m]
     "terrain.difficulty": [0.0, 1.0],
     "terrain.border_size": 4.0,
@@ -40,7 +43,8 @@ OVERRIDES: dict[str, Any] = {
     "init_state.pos_xy_range": 0.3,
     "init_state.yaw_range": math.pi,
 }
-SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}  # config fields that it decides itself
+# config fields that the user may not override
+SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}
 
 
 def prepare(task: LoadedTask, repeats: int = REPEATS) -> None:
@@ -51,7 +55,7 @@ def prepare(task: LoadedTask, repeats: int = REPEATS) -> None:
 
 
 def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
-    """Tiles of each kind of ground that has a share in ``terrain.terrain_proportions``, and ``repeats`` robots for each tile."""
+    """Set up tiles of each kind with a share in ``terrain.terrain_proportions``, and ``repeats`` robots per tile."""
     ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0]
     if not kinds:
@@ -63,10 +67,10 @@ def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
 
 
 def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
-    """Grade ``policy`` in an environment made from a prepared task: by kind and level the shares that crossed and that fell."""
+    """Grade ``policy`` in the environment of a prepared task: the shares of crossings and falls by kind and level."""
     assert env.tiles
     kinds = env.tiles.kinds
-    repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds go kind by kind, column by column, level by level
+    repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds are sorted by kind, column, level
     with torch.random.fork_rng([env.device] if env.device.startswith("cuda") else []):
         torch.manual_seed(0)
         env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
@@ -78,7 +82,7 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 
 def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
-    """Which worlds came ``edge`` [m] away from the middle along x or y, and which fell before that, each (N,)."""
+    """Two masks (N,): worlds that moved ``edge`` [m] from the middle along x or y, and worlds that fell before that."""
     command = torch.tensor(
         [SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device
     )
@@ -95,12 +99,12 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
         over |= dones
         crossed |= (env.max_distance[:, 0] > edge) & ~over
         over |= crossed
-        env.commands.copy_(command)  # in a world that was reset too; it no longer counts
+        env.commands.copy_(command)  # a reset redraws it; worlds that were reset no longer count
     return crossed, fell
 
 
 def _measure(kind: str) -> dict[str, Any]:
-    """What makes a kind hard and its value at each level; None where nothing does."""
+    """The quantity that makes a kind hard, and its value at each level; None if there is none."""
     if kind not in MEASURES:
         return {"measure": None, "values": None}
     return {
@@ -110,7 +114,7 @@ def _measure(kind: str) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Shares that crossed, a line a kind, a column a level; at the end the means over all levels, of those that fell too."""
+    """The share of crossings, one line per kind and one column per level, then the mean shares crossed and fallen."""
     kinds = result["kinds"]
     lines = [
         f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"

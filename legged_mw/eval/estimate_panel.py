@@ -1,4 +1,4 @@
-"""The report's picture of an estimator: the velocity that the simulator knows and the one that the policy believes, command by command."""
+"""The report's plot of a velocity estimator: true and estimated velocity, command by command."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ WIDTH, HEIGHT = 7.2, 2.1  # [inch]
 
 
 def draw(estimate: dict[str, Any], k: int, colours: tuple[str, str, str], title: str, ax: Any) -> None:
-    """Axis ``k`` of ``figures.estimates``: the commands side by side; ``colours`` of truth, estimate and the borders between commands."""
+    """Plot axis ``k`` of ``figures.estimates``, with the commands side by side.
+
+    ``colours``: of the true velocity, of the estimate, of the borders between commands.
+    """
     ink, colour, faint = colours
     commands, seconds = estimate["commands"], estimate["seconds"]
     for key, tone, label in (("truth", ink, "true"), ("estimate", colour, "estimated")):
         values = np.array(estimate[key][k], dtype=float).reshape(len(commands), -1)
         time = np.linspace(0.0, seconds, values.shape[1]) + seconds * np.arange(len(commands))[:, None]
-        apart = ((0, 0), (0, 1))  # no line from one command to the next
+        apart = ((0, 0), (0, 1))  # NaN: no line from one command to the next
         lines = (np.pad(rows, apart, constant_values=np.nan).ravel() for rows in (time, values))
         ax.plot(*lines, color=tone, linewidth=1.0, label=label)
     for i in range(1, len(commands)):

@@ -1,7 +1,8 @@
-"""The walking exam in the training environment; what it asks and what passes is in ``rules``.
+"""The walking exam in the training environment. ``rules`` has its commands, measures and pass marks.
 
-Nominal model, no noise, no pushes but the exam's own, mean actions, start at rest in the default pose. It is a set of config
-overrides and a roll-out, not a second environment: all tests run side by side as worlds of one environment.
+The exam uses the nominal model without noise, the policy's mean actions, and no pushes except those of the exam.
+The robot starts at rest in the default pose. The exam is a set of config overrides and one roll-out: each test is
+one world of the same environment.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ OVERRIDES: dict[str, Any] = {
     "init_state.yaw_range": 0.0,
     "init_state.lin_vel_range": 0.0,
     "init_state.ang_vel_range": 0.0,
-    "termination.max_tilt": 90.0,  # [deg], a fall
-    "termination.min_base_height": 0.0,  # and nothing else
+    "termination.max_tilt": 90.0,  # [deg]; only a larger tilt is a fall
+    "termination.min_base_height": 0.0,
 }
-# what the exam decides; another robot than the nominal one may be asked for
+# Config fields that the user may not override. Domain randomization may be: it exams other than the nominal robot.
 SETS = {*OVERRIDES, "env.num_envs"} - {"domain_rand.enable"}
 
 SIGNALS: dict[str, Signal] = {
@@ -49,20 +50,20 @@ SIGNALS: dict[str, Signal] = {
 
 
 def prepare(task: LoadedTask, worlds: int | None = None) -> None:
-    """Turn ``task`` into the exam: one world a command and one a push, unless ``worlds`` says how many."""
+    """Turn ``task`` into the exam with ``worlds`` worlds; by default one per command and one per push."""
     for path, value in OVERRIDES.items():
         task.set(path, value, where="exam")
     task.cfg.env.num_envs = worlds or ExamRules.from_config(task.cfg).worlds()
 
 
 def cases(rules: ExamRules, dt: float, push_at: float | None = None) -> list[Case]:
-    """The exam's worlds, in the order that ``ExamRules.grade`` expects; the first pushes come at ``push_at`` [s]."""
+    """The cases of the exam in the order of ``ExamRules.grade``. The first pushes come at ``push_at`` [s]."""
     at = PUSH_AT if push_at is None else push_at
     return [*map(holding, rules.held()), *pushes(rules, (rules.push_vx, 0.0, 0.0), round(at / dt))]
 
 
 def pushes(rules: ExamRules, command: Velocity, step: int) -> list[Case]:
-    """At ``step`` + k, direction k of every speed."""
+    """One push per case, at every speed and in every direction. Direction k comes at control step ``step`` + k."""
     angles = [2 * math.pi * k / PUSH_DIRECTIONS for k in range(PUSH_DIRECTIONS)]
     return [
         holding(command, Push(step + k, speed, angle)) for speed in rules.push_speeds for k, angle in enumerate(angles)
@@ -70,13 +71,13 @@ def pushes(rules: ExamRules, command: Velocity, step: int) -> list[Case]:
 
 
 def run_exam(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
-    """Grade ``policy`` in an environment made from a prepared task."""
+    """Grade ``policy`` in the environment of a prepared task."""
     rules = ExamRules.from_config(env.cfg)
     return grade(rules, roll_out(env, policy, cases(rules, env.dt), round(SECONDS / env.dt), SIGNALS))
 
 
 def grade(rules: ExamRules, record: Record) -> dict[str, Any]:
-    """What ``rules`` makes of a record whose worlds are the exam's."""
+    """Grade a record of the exam's worlds by ``rules``."""
     return rules.grade(
         record.signals, last_position=record.last_position, fell_at=record.fell_at, mass=record.mass, dt=record.dt
     )

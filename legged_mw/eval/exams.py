@@ -1,4 +1,4 @@
-"""The exams, one a kind of task, and which of them grades a task: what play.py and train.py know of exams."""
+"""The table of exams, and the look-up of a task's exam. play.py and train.py use exams through this table only."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from legged_mw.utils.task import LoadedTask
 
 
 class Examiner(Protocol):
-    """The exam during training: called with a policy it gives figures by name."""
+    """The exam during training: a call with a policy returns figures by name."""
 
     env: RobotTask
 
@@ -28,23 +28,23 @@ class Examiner(Protocol):
 
 
 class Exam(NamedTuple):
-    """One kind of exam. A result and figures are dicts that JSON can hold."""
+    """One kind of exam. Its result and its figures are dicts of JSON values."""
 
-    sets: Callable[[LoadedTask], set[str]]  # config fields that it decides itself, so that nobody may override them
-    prepare: Callable[[LoadedTask], None]  # turn a task into the exam
-    make_room: Callable[[LoadedTask], None]  # set the number of worlds once more, after the user's overrides
-    ask_alike: Callable[[Sequence[LoadedTask]], None]  # grade prepared tasks by the rules of the first
-    # (env, policy, env of the rough part or None) -> result, figures
+    sets: Callable[[LoadedTask], set[str]]  # config fields that the user may not override
+    prepare: Callable[[LoadedTask], None]  # turns a task into the exam
+    make_room: Callable[[LoadedTask], None]  # sets the number of worlds again, after the user's overrides
+    ask_alike: Callable[[Sequence[LoadedTask]], None]  # grades all prepared tasks by the rules of the first
+    # (environment, policy, environment of the rough part or None) -> result, figures
     examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]
-    rules: Callable[[LoadedTask], ExamRules | Skill]  # what a prepared task is graded by, also on another physics
+    rules: Callable[[LoadedTask], ExamRules | Skill]  # of a prepared task, also for another physics engine
     table: Callable[[dict[str, Any]], str]  # the result as text
     write: Callable[..., None]  # the report: see report.write
     in_training: Callable[[LoadedTask, str, bool], Examiner]  # task, device, eager
-    rough: ModuleType | None = None  # a second part for tasks on rough ground, with prepare, SETS, make_room and table
+    rough: ModuleType | None = None  # second part for rough terrain, with prepare, SETS, make_room and table
 
 
 def _skill(kind: str) -> Exam:
-    """The exam of a kind of ``SKILLS``."""
+    """The exam for one kind of ``SKILLS``."""
     return Exam(
         sets=lambda task: {*perform.overrides(task), "env.num_envs"} - {"domain_rand.enable"},
         prepare=perform.prepare,
@@ -76,14 +76,14 @@ EXAMS = {
 
 
 def find_exam(task: LoadedTask) -> Exam | None:
-    """The exam that grades ``task``; None if it names none. Raises ConfigError for a kind that does not exist."""
+    """The exam of ``task``; None if the task names none. Raises ConfigError for an unknown name."""
     if task.exam and task.exam not in EXAMS:
         raise ConfigError(f"{task.path}: {unknown('exam', task.exam, EXAMS, 'legged_mw/eval/exams.py')}")
     return EXAMS.get(task.exam)
 
 
 def require_exam(task: LoadedTask) -> Exam:
-    """The exam of a task that is to be graded. Raises ConfigError if it has none."""
+    """The exam of ``task``. Raises ConfigError if it has none."""
     if not (found := find_exam(task)):
         hint = "A task that walks by command has the walking exam, another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)"
         raise ConfigError(f"--eval: no exam grades task '{task.name}'; there are: {', '.join(EXAMS)}. {hint}")
@@ -91,16 +91,16 @@ def require_exam(task: LoadedTask) -> Exam:
 
 
 def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner | None:
-    """The exam for a policy that trains in ``env``; None if the task has none.
+    """The exam during the training in ``env``; None if the task has none.
 
-    None, too, and a line that says why, if the policy could not read the exam's nominal world.
+    Also None, with a printed reason, if the policy cannot read the observations of the exam's nominal world.
     """
     if not (kind := find_exam(task)):
         return None
     examine = kind.in_training(task, env.device, eager)
     here, there = env.get_observations(), examine.env.get_observations()
     for group in task.train.obs_groups.actor:
-        # a group that does not exist is the learner's to refuse
+        # the learner reports an unknown group
         if group in here and here[group].shape[1] != there[group].shape[1]:
             sizes = f"{there[group].shape[1]} values in the exam's nominal world and {here[group].shape[1]} in training"
             print(f"no exam during training: the actor's observation group '{group}' has {sizes}")

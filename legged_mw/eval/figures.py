@@ -1,7 +1,7 @@
-"""Figures from a record: numpy in, plain numbers out. Nothing here knows a simulator, and nothing is drawn here.
+"""The report's figures from a record: numpy arrays in, plain numbers out. No simulator, no drawing.
 
-N worlds, T control steps, D joints, F feet. What fell is None, and is not part of any mean here; the exam's own means, in ``rules``,
-count it. "Settled" is what is left after the exam's first seconds.
+N worlds, T control steps, D joints, F feet. A world that fell is None and is left out of every mean here. The exam's
+means in ``rules`` count it. ``settled`` is the first control step after the exam's settling time.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from legged_mw.eval.rules import GRAVITY, PUSH_DIRECTIONS, SLOW
 if TYPE_CHECKING:
     from legged_mw.eval.rollout import Record
 
-SATURATED = 0.98  # of the limit, from which on a torque counts as at it
-STRAY = 0.3  # of a step: farther from its start or its end the robot is not there
-SHORT_SWING = 2  # [control steps] in the air that make a swing; less is a foot that chatters
+SATURATED = 0.98  # share of the limit: a larger torque counts as saturated
+STRAY = 0.3  # share of the step: tolerance for being at its start or at its end
+SHORT_SWING = 2  # [control steps] shortest swing; a shorter time in the air is chatter of the contact
 BINS = 40  # of a joint's histogram
 
 Array = NDArray[Any]
@@ -31,18 +31,18 @@ Array = NDArray[Any]
 
 def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[float | None]]]:
     """Mean absolute error of vx, vy, yaw rate over a grid of worlds: 3 x rows x columns."""
-    # (N, 3)
+    # mean over time, (N, 3)
     error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:, :, :3]).mean(axis=0, dtype=float)
     error[np.isfinite(record.fell_at)] = np.nan
     return [plain(error[:, k].reshape(rows, -1)) for k in range(3)]
 
 
 def step_response(time: Array, measured: Array, start: float, target: float) -> dict[str, float | None]:
-    """How ``measured`` (T,) goes from ``start`` to ``target``, which is commanded from time 0 on.
+    """The response of ``measured`` (T,) to a command that steps from ``start`` to ``target`` at time 0.
 
-    ``rise_time``: from 10 to 90 % of the way [s]. ``overshoot``: how far beyond the target, as a share of the way. Both are
-    None if it was not near the start, or does not stay near the target: a twitch is no response.
-    ``left``: mean difference to the target in the last half second, in the unit of what is measured.
+    ``rise_time``: from 10 to 90 % of the step [s]. ``overshoot``: beyond the target, as a share of the step.
+    Both are None if ``measured`` does not begin near the start or does not settle near the target.
+    ``left``: mean difference to the target in the last half second, in the unit of ``measured``.
     """
     way = (measured - start) / (target - start)
     after = (time >= 0.0) & np.isfinite(way)
@@ -59,7 +59,7 @@ def step_response(time: Array, measured: Array, start: float, target: float) -> 
 
 
 def _first_crossing(time: Array, values: Array, level: float) -> float | None:
-    """When ``values`` first reaches ``level``, between the samples."""
+    """The time at which ``values`` first reaches ``level``, interpolated between samples."""
     i = int(np.argmax(values >= level))
     if values[i] < level:
         return None
@@ -67,9 +67,9 @@ def _first_crossing(time: Array, values: Array, level: float) -> float | None:
 
 
 def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
-    """Worlds that get the same command from step ``begin`` on: command, and mean, lowest and highest of one axis at each time.
+    """The response along one axis of worlds that get the same command from step ``begin`` on.
 
-    A world that falls is left out.
+    Returns the command, and mean, lowest and highest velocity over time. Worlds that fall are left out.
     """
     commanded, stood = record.commands[begin:, 0, axis], np.isinf(record.fell_at)
     moved = record.signals["velocity"][begin:, stood, axis].astype(float)
@@ -83,7 +83,7 @@ def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
 
 
 def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any]]:
-    """The response to each change of the command, until the next."""
+    """The response to each change of the command, up to the next change."""
     borders = [*(np.flatnonzero(np.diff(commanded)) + 1), len(time)]
     found = []
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
@@ -99,7 +99,10 @@ def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any
 
 
 def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: float) -> dict[str, Any]:
-    """True and estimated vx, vy [m/s] (2, T) in the last ``seconds`` of each command's world, one after another; None where it fell."""
+    """True and estimated vx, vy [m/s] in the last ``seconds`` of each command, joined in time (2, T).
+
+    None where the world fell.
+    """
     last = round(seconds / record.dt)
     found: dict[str, Any] = {"commands": [list(command) for command in commands], "seconds": last * record.dt}
     for name, signal in (("truth", "velocity"), ("estimate", "estimate")):
@@ -113,14 +116,14 @@ def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: floa
 
 
 def duty_factor(contact: Array) -> list[float]:
-    """Share of the time that each foot is down; ``contact`` (T, F)."""
+    """The share of time that each foot is in contact; ``contact`` (T, F)."""
     return contact.mean(axis=0, dtype=float).tolist()
 
 
 def stride_frequency(contact: Array, dt: float) -> float:
-    """Strides a second, mean over the feet that step; ``contact`` (T, F). 0 if none does.
+    """Strides per second [Hz], mean over the feet that step; 0 if none steps. ``contact`` (T, F).
 
-    A stride is from touch-down to touch-down; a touch-down ends a swing of at least ``SHORT_SWING`` samples.
+    A stride lasts from touch-down to touch-down. A touch-down ends a swing of at least ``SHORT_SWING`` samples.
     """
     rates = []
     for down in contact.T.astype(bool):
@@ -132,7 +135,7 @@ def stride_frequency(contact: Array, dt: float) -> float:
 
 
 def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], seconds: float) -> list[dict[str, Any]]:
-    """Of each command's world: duty factor, stride frequency, and which foot is down in the last ``seconds`` (F, T)."""
+    """For each command: duty factor, stride frequency, and the contacts (F, T) in the last ``seconds``."""
     found = []
     for world, command in enumerate(commands):
         contact, fell = record.signals["contact"][settled:, world], bool(np.isfinite(record.fell_at[world]))
@@ -150,9 +153,9 @@ def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], sec
 
 
 def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) -> dict[str, Any]:
-    """What ``values`` (S, D) are, joint by joint, and the share of samples outside ``margin`` times ``low`` to ``high`` (D,).
+    """The distribution of ``values`` (S, D) for each joint, and the share of samples beyond the limits.
 
-    An infinite limit is none, and has no share.
+    ``low``, ``high``: the limits (D,), multiplied by ``margin``. Infinite means no limit, and no share is computed.
     """
     if not len(values):
         return {"low": [], "high": [], "edges": [], "density": [], "quantiles": [], "saturated": []}
@@ -172,7 +175,10 @@ def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) ->
 
 
 def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]]) -> dict[str, Any]:
-    """Distributions of joint position, velocity and torque over the worlds that stood; ``limits``: signal -> (low, high), (D,)."""
+    """Distributions of joint position, velocity and torque over the worlds that did not fall.
+
+    ``limits``: signal -> (low, high), each (D,).
+    """
     stood = np.isinf(record.fell_at)
     found = {}
     for name, (low, high) in limits.items():
@@ -186,12 +192,12 @@ def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]])
 
 
 def survival(fell_at: Array, until: int) -> list[list[bool]]:
-    """Not fallen up to step ``until``: speeds x directions."""
+    """Whether each pushed robot still stood at step ``until``: speeds x directions."""
     return (fell_at > until).reshape(-1, PUSH_DIRECTIONS).tolist()
 
 
 def transport(record: Record, settled: int) -> dict[str, list[float | None]]:
-    """Of each world: speed over ground [m/s] along a straight line, mean power [W], cost of transport [-]."""
+    """For each world: speed [m/s] along the straight line from start to end, mean power [W], cost of transport [-]."""
     power = record.signals["power"][settled:].mean(axis=0, dtype=float)
     seconds = (len(record.signals["power"]) - settled) * record.dt
     speed = np.linalg.norm(record.last_position - record.signals["position"][settled], axis=1) / seconds
@@ -202,7 +208,10 @@ def transport(record: Record, settled: int) -> dict[str, list[float | None]]:
 
 
 def reward_shares(record: Record, settled: int, names: Sequence[str]) -> dict[str, float | None]:
-    """Each term's scale * term a second, mean over the worlds that stood; ``reward`` (T, N, K) is the sum since the start."""
+    """For each term: scale * term per second, mean over the worlds that did not fall.
+
+    The signal "reward" (T, N, K) is the sum since the start of the episode.
+    """
     summed = record.signals["reward"][:, np.isinf(record.fell_at)].astype(float)
     seconds = (len(summed) - 1 - settled) * record.dt
     if not summed.shape[1] or seconds <= 0:
@@ -211,7 +220,7 @@ def reward_shares(record: Record, settled: int, names: Sequence[str]) -> dict[st
 
 
 def plain(values: Array) -> list[Any]:
-    """Nested lists as JSON knows them: what is not finite is None."""
+    """Nested lists for JSON; None for values that are not finite."""
     if values.ndim > 1:
         return [plain(row) for row in values]
     return [float(v) if math.isfinite(v) else None for v in values]

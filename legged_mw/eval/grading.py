@@ -1,4 +1,4 @@
-"""What ``play.py --eval`` does: the exam and the report of one policy, or of two side by side."""
+"""``play.py --eval``: grade one policy, or two side by side, and write the report."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from legged_mw.utils.task import LoadedTask
 
 
 class Graded(NamedTuple):
-    """A policy and the tasks that it is graded in."""
+    """A policy and the tasks of its exam."""
 
     source: PolicySource
     trained: LoadedTask
     task: LoadedTask
     exam: Exam
-    crossing: LoadedTask | None  # for the exam's rough part, if there is one
+    crossing: LoadedTask | None  # the rough part of the exam, if there is one
 
 
 Elsewhere = Callable[[Graded], list[tuple[str, dict[str, Any]]]]  # results by name
 
 
 def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
-    """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first.
+    """Grade policies, each with its trained config. Print their tables and write a report next to the first.
 
-    ``elsewhere`` grades the first policy once more, on another physics.
+    ``elsewhere`` grades the first policy again on another physics engine.
     """
     device = pick_device(args.device)
     first, *rivals = policies
@@ -47,40 +47,40 @@ def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namesp
     introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
     folder = graded[0].source.results(graded[0].task) / "eval"
     writable(str(folder), "the report goes to", folder=True)
-    built = [(each, *build(each, args, device)) for each in graded]  # all, before one is graded in vain
+    built = [(each, *build(each, args, device)) for each in graded]  # an error must come before a long exam
     columns = [make_column(*each) for each in built]
     graded[0].exam.write(folder, graded[0].task.name, columns, elsewhere(graded[0]))
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 
 
 def prepare(source: PolicySource, trained: LoadedTask, args: argparse.Namespace, common: bool = False) -> Graded:
-    """The trained task with what the exam changes, the user's overrides last.
+    """The trained task with the overrides of the exam, then those of the user.
 
-    ``common``: in the one range that all published policies of the robot were asked.
+    ``common``: use the one command range in which all published policies of the robot were measured.
     """
     task, exam = copy.deepcopy(trained), require_exam(trained)
     exam.prepare(task)
     override(task, args, exam.sets(task))
     if common:
         task.update({"exam": in_common(getattr(getattr(task.cfg, "exam", None), "peer", ""))}, where="--ranges common")
-    exam.make_room(task)  # the ranges are known by now
+    exam.make_room(task)  # after the user's overrides: they may change the ranges
     return Graded(source, trained, task, exam, prepare_crossing(trained, args))
 
 
 def prepare_crossing(trained: LoadedTask, args: argparse.Namespace) -> LoadedTask | None:
-    """The exam's rough part with the user's overrides; None where training was on a plane."""
+    """The rough part of the exam with the user's overrides; None if the policy trained on a plane."""
     crossing = require_exam(trained).rough
     if not crossing or trained.to_dict()["terrain"].get("mesh_type", "plane") == "plane":
         return None
     task = copy.deepcopy(trained)
     crossing.prepare(task)
     override(task, args, crossing.SETS)
-    crossing.make_room(task)  # the kinds of ground are known by now
+    crossing.make_room(task)  # after the user's overrides: they may change the kinds of terrain
     return task
 
 
 def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None:
-    """Apply the user's overrides, unless one of them changes what the exam ``sets`` itself."""
+    """Apply the user's overrides. Refuse an override of a field that the exam ``sets``."""
     before = copy.deepcopy(task)
     apply_overrides(task, args)
     check_classes(task.train)
@@ -91,7 +91,7 @@ def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None
 
 
 def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, RobotTask, RobotTask | None]:
-    """The policy, the environment of the exam, and the one of its rough part."""
+    """Build the policy, the environment of the exam, and that of the rough part."""
     task, rough = graded.task, graded.crossing
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)
@@ -100,7 +100,7 @@ def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy
 
 
 def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask | None) -> Column:
-    """The exam and all else of a report, from one roll-out and, if there is a rough part, another; prints their tables."""
+    """Run the exam and, if there is one, its rough part. Print their tables and return the report's column."""
     source, exam = graded.source, graded.exam
     result, figures = exam.examine(env, policy, rough)
     name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"

@@ -1,4 +1,7 @@
-"""The exam `handstand`, of handstands and footstands: from all fours to two legs, and five seconds there. Needs numpy and MuJoCo alone."""
+"""The exam `handstand`: rise from four legs to a handstand or footstand and hold it for 5 s.
+
+Needs only numpy and MuJoCo.
+"""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -13,16 +16,17 @@ import numpy as np
 from legged_mw.eval.skill import ExamGround, ExamRobot, Floats, Measure, Recording, Skill
 from legged_mw.skills.clip import rotate
 
-SEED, OFFSET = 30_000, 0.05  # of the starts; each joint is off by U(-OFFSET, OFFSET) [rad] [ours]
-WITHIN, HOLD = 3.0, 5.0  # [s] in which it must be up, and stay [ours]
-TILT, HIGH = 30.0, 0.8  # [deg] between the root's x axis and the vertical, share of the height: up [ours]
+SEED, OFFSET = 30_000, 0.05  # of the starts: each joint angle is offset by U(-OFFSET, OFFSET) [rad] [ours]
+WITHIN, HOLD = 3.0, 5.0  # [s] time limit for rising, time to hold [ours]
+# The robot is up: [deg] largest angle from the root's x axis to the vertical, least share of the height [ours].
+TILT, HIGH = 30.0, 0.8
 
 
 @dataclass(frozen=True)
 class HandstandExam(Skill):
-    """64 tries on each ground."""
+    """64 attempts on each ground."""
 
-    nose: float = -1.0  # -1 down, 1 up
+    nose: float = -1.0  # direction of the root's x axis: -1 down, 1 up
     height: float = 0.55  # [m] of the root
     hands: tuple[str, ...] | list[str] = ()  # geoms that may touch the ground
 
@@ -49,7 +53,7 @@ class HandstandExam(Skill):
 
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         touching, hands = self._ground_contact(robot, recording.qpos)
-        ahead = rotate(recording.qpos[..., 3:7], np.array([1.0, 0.0, 0.0]))  # the root's x axis, in the world
+        ahead = rotate(recording.qpos[..., 3:7], np.array([1.0, 0.0, 0.0]))  # the root's x axis in the world frame
         upright = self.nose * ahead[..., 2] > np.cos(np.radians(TILT))
         alive = np.arange(len(touching))[:, None] <= recording.ended_at
         up = upright & (recording.qpos[..., 2] > HIGH * self.height) & ~touching & alive  # (T, N)
@@ -65,12 +69,12 @@ class HandstandExam(Skill):
             "median": float(np.median(begin[holds]) * robot.dt) if holds.any() else None,
             "drift": float(drift[holds].mean()) if holds.any() else None,
             "power": float(power[up].mean()) if up.any() else None,
-            # a robot that did not, or the one that drifted most
+            # a robot that failed, else the one that drifted most
             "worst": int(np.argmax(np.where(holds, drift, np.inf))),
         }
 
     def _ground_contact(self, robot: ExamRobot, qpos: Floats) -> tuple[np.ndarray, np.ndarray]:
-        """(T, N) whether anything but the hands touches the ground, and (T, N, 2) the middle of the hands [m]."""
+        """(T, N): a geom other than the hands touches the ground. (T, N, 2): the midpoint of the hands [m]."""
         model, data = robot.model, mujoco.MjData(robot.model)
         free = np.array([model.geom(name).id for name in self.hands])
         steps, count = len(qpos), qpos.shape[1]

@@ -1,6 +1,6 @@
-"""Torque against speed of each kind of joint, and the motor's envelope around it: the report's numbers and its picture of them.
+"""Motor use in the report: torque against speed for each kind of joint, inside the motor's torque-speed envelope.
 
-Numpy in, plain numbers out; the picture is drawn on the axes that it is given.
+Numpy arrays in, plain numbers out. ``draw`` plots them on the given axes.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 BINS = (40, 32)  # of speed and torque
-NEAR = 0.02  # of the highest torque: so near to the envelope counts as at it
-MARGIN = 1.08  # of what is drawn around samples and envelope
+NEAR = 0.02  # share of the highest torque: a sample this close to the envelope counts as at the limit
+MARGIN = 1.08  # size of the plot relative to samples and envelope
 
 
 class MotorLimits(NamedTuple):
-    """What motors can do, (D,) each; infinite where nothing is known."""
+    """The motors' limits, each (D,); infinite where unknown."""
 
     low: Array  # [N m]
     high: Array  # [N m]
@@ -36,14 +36,14 @@ class MotorLimits(NamedTuple):
         )
 
     def of(self, joint: int) -> MotorLimits:
-        """Of one joint, (1,) each."""
+        """The limits of one joint, each (1,)."""
         return MotorLimits(*(values[joint : joint + 1] for values in self))
 
 
 def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorLimits) -> list[dict[str, Any]]:
-    """Of each kind of joint how often which torque came at which speed, where its motor ends, and the share of time that it is there.
+    """For each kind of joint: a histogram of torque and speed, the motor's envelope, and the share of time at it.
 
-    ``kinds`` (D,): joints of one kind share a picture; their motors are alike. Worlds that fell do not count.
+    ``kinds`` (D,): joints of the same kind share a plot and must have equal motors. Worlds that fell are left out.
     """
     stood = np.isinf(record.fell_at)
     torque, speed = (record.signals[name][settled:, stood].astype(float) for name in ("torque", "motor_speed"))
@@ -64,7 +64,7 @@ def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorL
 
 
 def _picture(torque: Array, speed: Array, limits: MotorLimits) -> dict[str, Any]:
-    """Counts of samples on a grid, and the envelope over its speeds."""
+    """The counts of samples on a grid of speed and torque, and the envelope over the same speeds."""
     free = float(limits.no_load_speed[0])
     widest = max(float(np.abs(speed).max(initial=1.0)), min(free, 1e3) if np.isfinite(free) else 0.0) * MARGIN
     strong = float(np.minimum(limits.high, limits.stall_torque)[0])
@@ -76,15 +76,16 @@ def _picture(torque: Array, speed: Array, limits: MotorLimits) -> dict[str, Any]
     return {
         "speeds": speeds.round(4).tolist(),
         "torques": torques.round(4).tolist(),
-        "counts": counts.T.astype(int).tolist(),  # torque by speed
+        "counts": counts.T.astype(int).tolist(),  # (torque, speed)
         "envelope": {"speed": line.round(4).tolist(), "low": low, "high": high} if bounded else None,
     }
 
 
 def draw(motor: dict[str, Any], heat: Any, ink: tuple[str, str], suffix: str, ax: Any) -> None:
-    """One kind of joint: the more often, the darker by the colour map ``heat``; ``ink`` of the envelope and of remarks."""
+    """Plot one kind of joint. ``heat``: colour map of the counts. ``ink``: colours of the envelope and of the notes."""
     counts, speeds, torques = (np.array(motor[key], dtype=float) for key in ("counts", "speeds", "torques"))
-    rows, columns = np.nonzero(counts)  # a mesh would draw the empty cells, too, and make a page of megabytes
+    # only cells with samples: a full mesh would make a page of megabytes
+    rows, columns = np.nonzero(counts)
     often = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
     ax.bar(
         speeds[columns],

@@ -1,4 +1,4 @@
-"""The report as one page: text, tables and drawn panels in, HTML out. Nothing in it is loaded from anywhere else."""
+"""The report as one self-contained HTML page, from text, tables and drawn panels."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ STROKE = "The stroke on each scale is what the exam allows on average. "
 
 
 class Column(NamedTuple):
-    """One policy in one physics."""
+    """One policy in one physics engine: a column of the tables."""
 
     name: str
-    about: dict[str, Any]  # policy, engine, device, overrides; warning, if the physics had too little room
-    exam: dict[str, Any]  # what ``ExamRules.grade`` gives
-    figures: dict[str, Any] | None = None  # None: only the exam is known
+    about: dict[str, Any]  # policy, engine, device, overrides; a warning if contact buffers overflowed
+    exam: dict[str, Any]  # the result of ``ExamRules.grade``
+    figures: dict[str, Any] | None = None  # None: exam result only
 
 
 def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:
-    """The whole page; ``rules`` are those of the first column."""
+    """The whole page. ``rules``: those of the first column."""
     words: dict[str, Any] = {
         "speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)),
         "vx": rules.push_vx,
@@ -85,7 +85,7 @@ def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence
 
 
 def _names(columns: Sequence[Column], rules: ExamRules) -> str:
-    """The graded policies and whether they pass, each in the colour of its curves."""
+    """The graded policies in the colours of their curves, with pass or fail."""
     items, drawn = [], [column.name for column in columns if column.figures]
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
@@ -98,7 +98,7 @@ def _names(columns: Sequence[Column], rules: ExamRules) -> str:
 
 
 def _said(words: str) -> tuple[str, str]:
-    """``walks`` or ``beats ...``, and that it does not."""
+    """The words for true and for false of a verdict such as ``walks``."""
     verb, _, rest = words.partition(" ")
     return words, f"does not {verb.removesuffix('s')} {rest}".strip()
 
@@ -110,7 +110,7 @@ def pill(good: str, bad: str, yes: bool) -> str:
 
 
 def _cards(figures: Sequence[Figure]) -> str:
-    """The figures that one looks for first."""
+    """Cards with the most important figures."""
     cards = []
     for figure in figures:
         if figure.card:
@@ -133,7 +133,7 @@ def _mood(figure: Figure) -> str:
 def exam_table(
     columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str, asks: str = "walks at"
 ) -> str:
-    """A row a figure; from the second column on with the gap to the first."""
+    """A table with one row per figure. Later columns also show the gap to the first column."""
     lines = []
     for first, *others in zip(*figures, strict=True):
         cells = [f'<td><span class="value{_mood(first)}">{first.text(first.value)}</span></td>']
@@ -156,7 +156,7 @@ def exam_table(
 
 
 def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
-    """A row a policy: the graded ones, then the published ones."""
+    """A table with one row per policy: the graded policies, then the published ones."""
     peers = [(peer.name, peer.figures, f"{peer.asked['push_vx']:g}") for peer in rules.peers]
     rows = [(column.name, column.exam, f"{rules.push_vx:g}") for column in columns]
     heads = [
@@ -193,7 +193,7 @@ def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
 
 
 def _extra(name: str, columns: Sequence[Column]) -> str:
-    """The numbers that belong to a chapter's pictures; of two policies, row by row."""
+    """The table below a section's plots; two policies alternate row by row."""
     drawn = [column for column in columns if column.figures]
     figures: dict[str, Any] = drawn[0].figures or {}
     tables = {
@@ -209,7 +209,7 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
     if name not in tables:
         return ""
     make, heads, folded = tables[name]
-    # ranges may differ
+    # zip_longest, because the policies' command ranges may differ
     paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))
     return table(heads, [row for rows in paired for row in rows if row], folded)
 
@@ -253,7 +253,7 @@ def _joint_rows(column: Column, whose: str) -> list[list[str]]:
 
 
 def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
-    """A table; folded away below its title if it has one."""
+    """A table. With the title ``folded`` the reader unfolds it."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
         f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows
@@ -263,7 +263,7 @@ def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
 
 
 def about(columns: Sequence[Column]) -> str:
-    """What was graded on what, and what was changed for it."""
+    """The policies, their physics engines and devices, and the overrides."""
     parts = []
     for column in columns:
         about: dict[str, Any] = column.about

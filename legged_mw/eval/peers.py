@@ -1,8 +1,8 @@
-"""What published policies score in the walking exam. A task names its robot in the config section ``exam`` to have them stand beside it.
+"""Results of published policies in the walking exam. A task names its robot in ``exam.peer`` to be compared with them.
 
-Figures are comparable at the commands that they were taken with, so a peer is left out of any other exam. Measured in MuJoCo's C
-engine on 2026-11-21, each policy in its own or its vendor's scene, with its own observations, gains, rate and clock. None of them
-fell in any of its 22 commands.
+Figures compare only at equal commands, so a peer appears only beside an exam with the commands of its measurement.
+Measured in MuJoCo's C engine on 2026-11-21. Each policy ran in its own or its vendor's scene, with its own
+observations, gains, rate and clock. None of them fell in any of its 22 commands.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ Ranges = tuple[tuple[float, float], ...]  # lowest and highest vx, vy [m/s], yaw
 
 
 class Peer(NamedTuple):
-    """A policy's figures and what it was asked."""
+    """A published policy: its figures, and the rules of its measurement."""
 
     name: str
-    asked: dict[str, Any]  # fields of ExamRules that its figures depend on
-    figures: dict[str, Any]  # of the keys of an exam's result, those that are known
-    own_speed: bool = False  # pushes and cost of transport are of half of its own top speed, whatever the ranges
+    asked: dict[str, Any]  # values of the ExamRules fields that affect its figures
+    figures: dict[str, Any]  # the known keys of an exam's result
+    own_speed: bool = False  # pushes and cost of transport at half its own top speed, whatever the ranges
 
     def fits(self, rules: Any) -> bool:
-        """Whether it was asked what ``rules``, an ExamRules, ask."""
+        """Whether it was measured by the same commands and pushes as ``rules``, an ExamRules."""
         apart = ("push_vx", "transport_vx") if self.own_speed else ()
         return all(getattr(rules, name) == value for name, value in self.asked.items() if name not in apart)
 
 
-# One line a policy: name | highest vx [m/s], vy [m/s], yaw rate [rad/s] that it was trained for; asked from minus these to these |
-# mean error | worst command | offset of the mean velocity, three each in these units.
+# One line per policy: name | highest trained vx [m/s], vy [m/s], yaw rate [rad/s]; commands from minus to plus these |
+# mean error | error at the worst command | offset of the mean velocity, each (vx, vy, yaw rate) in these units.
 _GO2 = """
 DLS basic-locomotion              | 0.5 0.25 0.3 | 0.022 0.024 0.033 | 0.05 0.04 0.05 | 0.014 0.007 0.008
 go2_rl_gym, CTS (rough)           | 2 1 2        | 0.059 0.057 0.042 | 0.14 0.15 0.07 | 0.054 0.050 0.023
@@ -57,8 +57,9 @@ unitree_rl_mjlab, Jan 2026       | 1 0.5 1      | 0.065 0.076 0.125 | 0.23 0.25 
 unitree_rl_mjlab, Mar 2026       | 1 0.5 1      | 0.037 0.079 0.084 | 0.10 0.14 0.15 | 0.029 0.051 0.064
 RoboMimic deploy                 | 0.7 0.4 1.57 | 0.036 0.085 0.045 | 0.21 0.12 0.08 | 0.030 0.025 0.025
 """
-# The same policies, all asked one range: name | mean error | worst command | offset | and of both: drift [cm] | cost of transport |
-# pushes survived [%], the last two at half of the policy's own highest vx.
+# The same policies, all in one common range: name | mean error | error at the worst command | offset |
+# and valid for both ranges: drift [cm] | cost of transport | pushes survived [%].
+# The last two are measured at half of the policy's own highest vx.
 _GO2_COMMON = """
 DLS basic-locomotion              | 0.046 0.037 0.058 | 0.16 0.06 0.12 | 0.032 0.019 0.015 | 0.2  | 0.63 | 100 69 12 6 0 0 0 0
 go2_rl_gym, CTS (rough)           | 0.053 0.039 0.034 | 0.11 0.09 0.06 | 0.050 0.031 0.021 | 1.0  | 0.47 | 100 100 100 100 100 88 75 44
@@ -85,9 +86,9 @@ unitree_rl_mjlab, Jan 2026       | 0.065 0.078 0.097 | 0.23 0.30 0.47 | 0.065 0.
 unitree_rl_mjlab, Mar 2026       | 0.034 0.068 0.067 | 0.07 0.11 0.11 | 0.026 0.035 0.045 | 0.3   | 0.42 | 100 100 100 94 19
 RoboMimic deploy                 | 0.025 0.086 0.047 | 0.07 0.15 0.11 | 0.022 0.031 0.021 | 0.4   | 0.57 | 100 100 100 100 88
 """
-_SPEEDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)  # of pushes [m/s]; of a biped the first five
+_SPEEDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)  # of pushes [m/s]; a biped gets the first five
 
-# robot -> the one range that all its published policies were asked
+# robot -> the common command range of its published policies
 COMMON: dict[str, Ranges] = {
     "go2": ((-0.5, 1.0), (-0.4, 0.4), (-1.0, 1.0)),
     "g1": ((-0.5, 1.0), (-0.3, 0.3), (-0.5, 0.5)),
@@ -95,13 +96,13 @@ COMMON: dict[str, Ranges] = {
 
 
 def _read(trained: str, common: str, ranges: Ranges, speeds: tuple[float, ...]) -> list[Peer]:
-    """Each policy of the tables twice: as asked what it was trained for, and as asked the common ``ranges``."""
+    """Each policy of the tables twice: measured in its trained ranges, and in the common ``ranges``."""
     found, shared = [], {name: rest for name, *rest in map(_cells, common.strip().splitlines())}
     for name, top, *own in map(_cells, trained.strip().splitlines()):
         *alike, drift, cost, survived = shared[name]
         half = round(_numbers(top)[0] / 2, 4)
         asked = {"push_speeds": speeds, "push_vx": half, "transport_vx": half}
-        shares = [round(percent * 0.16) / 16 for percent in _numbers(survived)]  # of 16 directions
+        shares = [round(percent * 0.16) / 16 for percent in _numbers(survived)]  # share of the 16 directions
         rest = {
             "drift": round(float(drift) / 100, 5),
             "pushes": {f"{speed:g}": share for speed, share in zip(speeds, shares, strict=True)},
@@ -122,7 +123,7 @@ def _numbers(text: str) -> list[float]:
     return [float(number) for number in text.split()]
 
 
-# robot -> its published policies; of Go1 the one that ships with MuJoCo Playground
+# robot -> its published policies; the one for Go1 ships with MuJoCo Playground
 PEERS: dict[str, list[Peer]] = {
     "go1": [
         Peer(
@@ -150,7 +151,7 @@ ALIASES = {"playground_go1": "go1"}  # older runs and exports name a policy
 
 
 def robot_of(name: str) -> str:
-    """The key in ``PEERS`` for what ``exam.peer`` says; empty if it is. Raises ConfigError for one that does not exist."""
+    """The key in ``PEERS`` for the value of ``exam.peer``; empty for an empty value. Raises ConfigError if unknown."""
     name = ALIASES.get(name, name)
     if name and name not in PEERS:
         raise ConfigError(f"exam.peer: {unknown('robot', name, PEERS, 'legged_mw/eval/peers.py')}")
@@ -158,7 +159,7 @@ def robot_of(name: str) -> str:
 
 
 def best_of(peers: list[Peer]) -> dict[str, Any]:
-    """The best of each figure over all of ``peers``; no policy need have them all."""
+    """The best value of each figure over all ``peers``. One policy rarely has all of them."""
 
     def best(values: list[Any]) -> Any:
         if isinstance(values[0], list):

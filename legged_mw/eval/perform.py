@@ -1,4 +1,4 @@
-"""Exams of the kind ``skill`` in the training environment: for ``--eval``, for the report, and during training."""
+"""Skill exams in the training environment: for ``--eval``, for the report, and during training."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ NOMINAL: dict[str, Any] = {
 
 
 def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
-    """The exam of a task: its kind, with what the config section ``exam`` says."""
+    """The exam of the given kind with the values of the task's config section ``exam``."""
     return make_skill(kind, cfg.to_dict().get("exam", {}))
 
 
 def overrides(task: LoadedTask) -> dict[str, Any]:
-    """What the exam changes in the task; fields that it does not have are left out."""
-    # a task's own ends stay
+    """The exam's changes to the config. Fields that the task lacks are left out."""
+    # keep the task's own termination rules
     common = {path: value for path, value in exam.OVERRIDES.items() if not path.startswith("termination.")}
     wanted, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
     return {path: value for path, value in wanted.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
@@ -53,18 +53,21 @@ def prepare(task: LoadedTask) -> None:
 
 
 def make_room(task: LoadedTask) -> None:
-    """A world a robot."""
+    """Set one world per robot."""
     task.cfg.env.num_envs = skill_of(task.cfg, task.exam).robots
 
 
 def ask_alike(tasks: Sequence[LoadedTask]) -> None:
-    """Grade prepared tasks by what the first one's config asks."""
+    """Grade all prepared tasks by the config section ``exam`` of the first."""
     for task in tasks[1:]:
         task.update({"exam": tasks[0].to_dict()["exam"]} if "exam" in tasks[0].to_dict() else {}, where="--compare")
 
 
 def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The result, and what is drawn of it; ``env`` is made from a prepared task, each further ground needs one more."""
+    """The result and the pictures of the exam.
+
+    ``env`` comes from a prepared task and has the first ground. Each further ground builds another environment.
+    """
     skill, parts, strips = skill_of(env.cfg, kind), {}, {}
     for number, (name, ground) in enumerate(skill.grounds.items()):
         here = env if number == 0 else on_ground(env, ground)
@@ -76,8 +79,8 @@ def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tu
 
 
 def _draw(env: RobotTask, strips: Mapping[str, np.ndarray]) -> dict[str, bytes]:
-    """A picture of each robot, or none where nothing can be drawn."""
-    from legged_mw.eval.strip import strip  # OpenGL
+    """A picture of each robot, or none on a machine that cannot draw."""
+    from legged_mw.eval.strip import strip  # imports OpenGL
 
     try:
         return {name: strip(env, qpos) for name, qpos in strips.items()}
@@ -102,13 +105,13 @@ def on_ground(env: RobotTask, ground: ExamGround) -> RobotTask:
 
 
 def machine(env: RobotTask) -> ExamRobot:
-    """What the exam knows of the robot."""
+    """The robot's model, home state and time step for the exam."""
     home = np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose])
     return ExamRobot(env.robot.physics, home, env.dt, motion_of(env) if isinstance(env, MotionTracking) else None)
 
 
 def motion_of(env: MotionTracking) -> ReferenceMotion:
-    """The first clip."""
+    """The first clip of the task."""
     return ReferenceMotion(env.clips[0].qpos(), tuple(env.cfg.motion.bodies), env.cfg.motion.anchor)
 
 
@@ -119,7 +122,7 @@ def perform(
     ground: ExamGround = ExamGround(),  # noqa: B008
     starts: Starts | None = None,
 ) -> Recording:
-    """Put the robots of all worlds into their starts, or into ``starts`` where they are known, and let ``policy`` act."""
+    """Put each robot into its start state and run ``policy``. ``starts``: start states that are already computed."""
     env.reset()
     if starts := starts or skill.starts(machine(env), env.num_envs):
         for state, values in zip((env.sim.qpos, env.sim.qvel), starts, strict=True):
@@ -147,7 +150,7 @@ def perform(
 
 
 class InTraining:
-    """The first part of the exam for a policy that trains; see ``training.TrainingExam``, which is the walking exam's."""
+    """The first part of the exam during training. ``training.TrainingExam`` does the same for the walking exam."""
 
     def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
         copied = load_task(str(task.path))
@@ -166,7 +169,7 @@ class InTraining:
 
 
 def first_part(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> dict[str, float]:
-    """The figures of the part that a prepared task is, by name; those that there is nothing to measure of are left out."""
+    """Figures by name of the part that ``env`` was prepared for. Figures without a value are left out."""
     found = skill.judge(machine(env), perform(env, policy, skill, starts=starts))
     return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
 
@@ -177,7 +180,7 @@ def table(result: Mapping[str, Any]) -> str:
 
 
 def of_result(result: Mapping[str, Any]) -> Skill:
-    """The exam that gave a result."""
+    """The exam of a result."""
     return make_skill(
         result["asked"]["kind"], {name: value for name, value in result["asked"].items() if name != "kind"}
     )

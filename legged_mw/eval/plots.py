@@ -1,7 +1,7 @@
-"""Draws the report's figures with matplotlib, each panel as an inline SVG and each section as a PNG. No numbers are made here.
+"""Draw the report's figures with matplotlib: each panel as an inline SVG, each section as a PNG. Computes no numbers.
 
-Every panel is a function of an Axes, so that both formats show the same. In an SVG the colours become CSS variables: the page
-decides what they are in light and in dark. Palette: Okabe and Ito's, which colour-blind readers can tell apart.
+Every panel is a function of an Axes, so both formats show the same. In an SVG the colours become CSS variables, and
+the page sets them for light and dark mode. The palette of Okabe and Ito is safe for colour-blind readers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from legged_mw.eval.peers import best_of
 from legged_mw.eval.rules import AXES, ExamRules
 
 Figures = dict[str, Any]
-Columns = list[tuple[str, Figures]]  # (name, figures) of one policy or two
+Columns = list[tuple[str, Figures]]  # (name, figures) of one or two policies
 
 INK, MUTED, FAINT, PAPER = "#1b1f27", "#68707d", "#e3e6eb", "#fdfdfe"
 PAIR, GREEN = ("#0072b2", "#d55e00"), "#009e73"
@@ -77,29 +77,29 @@ STYLE: dict[Any, Any] = {
     **{"lines.linewidth": 1.4, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none"},
 }
 HEAT = "viridis"  # perceptually uniform
-GAITS = (1, 2, 3, 5, 7, 11)  # of the 22 commands, that are drawn: ahead, at three speeds; back; left; turning left
+GAITS = (1, 2, 3, 5, 7, 11)  # indices of the drawn commands: ahead at three speeds, back, left, turning left
 
 
 class PlotPanel(NamedTuple):
-    """One pair of axes."""
+    """One plot: a title and a function that draws on an Axes."""
 
     draw: Callable[[Any], None]
-    width: float = 3.5  # [inch], as all sizes
+    width: float = 3.5  # [inch]
     height: float = 2.5
     polar: bool = False
 
 
 class Section(NamedTuple):
-    """Panels that belong together: a PNG, and a chapter of the page."""
+    """A group of panels: one PNG, and one section of the page."""
 
     name: str
     title: str
     panels: list[PlotPanel]
-    across: int = 3  # panels side by side
+    across: int = 3  # panels per row
 
 
 def sections(columns: Columns, rules: ExamRules) -> list[Section]:
-    """All that is drawn of one policy or two, with the marks and the peer of the first one's rules."""
+    """All sections for one or two policies, with the pass marks and the peer from the rules of the first."""
     pushes = [PlotPanel(partial(_push_curve, columns, rules), height=2.9)]
     for which in ("walking", "standing"):
         for i, (name, figures) in enumerate(columns):
@@ -129,7 +129,7 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
 
 
 def svgs(section: Section) -> list[str]:
-    """The section's panels as SVG for the inside of a page: no names, no links, colours as CSS variables."""
+    """The section's panels as inline SVG: no ids, no links, colours as CSS variables."""
     drawn = []
     for i, panel in enumerate(section.panels):
         with rc_context({**STYLE, "svg.hashsalt": f"{section.name}{i}"}):
@@ -142,7 +142,7 @@ def svgs(section: Section) -> list[str]:
 
 
 def _inline(svg: str) -> str:
-    """An SVG file's content as part of an HTML page."""
+    """Turn the content of an SVG file into inline SVG."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(<(?:g|svg)\b[^>]*?) id="[^"]*"', r"\1", svg)
@@ -151,11 +151,11 @@ def _inline(svg: str) -> str:
     svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", "var(--font)", svg)
     for colour, name in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{name})")
-    return re.sub(r"(\.\d\d)\d+", r"\1", svg)  # a hundredth of a point is enough
+    return re.sub(r"(\.\d\d)\d+", r"\1", svg)  # round coordinates to a hundredth of a point
 
 
 def write_png(section: Section, path: Path) -> None:
-    """The section's panels as one picture, on the light background."""
+    """Write the section's panels as one PNG on a light background."""
     across = min(section.across, len(section.panels))
     rows = math.ceil(len(section.panels) / across)
     width, height = section.panels[0].width, max(panel.height for panel in section.panels)
@@ -165,16 +165,16 @@ def write_png(section: Section, path: Path) -> None:
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.08)  # type: ignore[union-attr]
         for i, panel in enumerate(section.panels):
             panel.draw(figure.add_subplot(rows, across, i + 1, projection="polar" if panel.polar else None))
-        FigureCanvasAgg(figure).print_png(path)  # savefig would draw it twice
+        FigureCanvasAgg(figure).print_png(path)  # savefig would draw the figure twice
 
 
 def _of(name: str, columns: Columns) -> str:
-    """The policy's name for a title, where there are two."""
+    """The policy's name for a title; empty if there is only one policy."""
     return f", {name}" if len(columns) > 1 else ""
 
 
 def _array(values: Any) -> np.ndarray:
-    """Nested lists with None as an array with NaN."""
+    """Convert nested lists to an array, None to NaN."""
     return np.array(values, dtype=float)
 
 
@@ -182,7 +182,7 @@ def _array(values: Any) -> np.ndarray:
 
 
 def _crossing_maps(columns: Columns) -> list[PlotPanel]:
-    """A map a policy that was graded on rough ground."""
+    """One map for each policy that was graded on rough terrain."""
     graded = [(_of(name, columns), figures["crossing"]) for name, figures in columns if "crossing" in figures]
     kinds = max((len(result["kinds"]) for _, result in graded), default=0)
     width, height = 6.2 if len(graded) == 1 else 5.2, 0.75 + 0.43 * kinds
@@ -190,7 +190,10 @@ def _crossing_maps(columns: Columns) -> list[PlotPanel]:
 
 
 def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
-    """A row a kind of ground, a cell a level: which share crossed, and which fell; below the cells what makes the kind hard."""
+    """Plot one row per kind of terrain and one cell per level, with the shares that crossed and that fell.
+
+    The text below the cells is the quantity that makes the kind hard.
+    """
     for row, kind in enumerate(kinds.values()):
         shares = _array([kind["crossed"], kind["fell"]])
         levels = shares.shape[1]
@@ -217,7 +220,7 @@ def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
 
 
 def _percent(share: float) -> str:
-    """In whole percent: 100 are all, 0 none."""
+    """Whole percent. Only a share of 1 is 100, only a share of 0 is 0."""
     return "<1" if 0.0 < share < 0.01 else f"{min(round(100 * share), 99) if share < 1.0 else 100}"
 
 
@@ -225,9 +228,9 @@ def _percent(share: float) -> str:
 
 
 def _heat_maps(columns: Columns, rules: ExamRules) -> list[PlotPanel]:
-    """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark.
+    """Heat maps of three errors over two grids. A scale ends at the largest error, at most at three times its mark.
 
-    Where the marks are of offsets, an error has none: its scale has no stroke, and may be longer.
+    If the marks are of offsets, the errors have no mark: the scale has no line and may be longer.
     """
     panels, strict = [], rules.marks_of == "error"
     marks = rules.marks if strict else [3 * mark for mark in rules.marks]
@@ -282,7 +285,7 @@ def _heat(
 
 
 def _edges(centres: np.ndarray) -> np.ndarray:
-    """Borders of cells around their centres."""
+    """The borders of cells from their centres."""
     half = np.diff(centres) / 2 if len(centres) > 1 else np.array([0.5])
     return np.concatenate([[centres[0] - half[0]], centres[:-1] + half[: len(centres) - 1], [centres[-1] + half[-1]]])
 
@@ -313,7 +316,7 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
 
 
 def _estimates(columns: Columns) -> list[PlotPanel]:
-    """A panel an axis of each policy that estimates its velocity."""
+    """One panel per axis for each policy with a velocity estimator."""
     panels = []
     for i, (name, figures) in enumerate(columns):
         for k in range(2 if "estimate" in figures else 0):
@@ -326,12 +329,12 @@ def _estimates(columns: Columns) -> list[PlotPanel]:
 
 
 def _gait(columns: Columns, world: int, ax: Axes) -> None:
-    """A bar where a foot is down; two policies share each foot's lane."""
+    """Plot a bar while a foot is in contact. Two policies share the lane of each foot."""
     feet, count = columns[0][1]["foot_names"], len(columns)
     rows, height = [figures["gait"][world] for _, figures in columns], 0.62 / count
     for i, row in enumerate(rows):
         for foot, down in enumerate(row["contact"] or []):
-            # begin and end of each stance
+            # start and end of each stance
             edges = np.flatnonzero(np.diff([0, *down, 0])).reshape(-1, 2) * columns[i][1]["dt"]
             bars = [(begin, end - begin) for begin, end in edges]
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
@@ -356,7 +359,7 @@ def _joint_panels(columns: Columns) -> list[PlotPanel]:
 
 
 def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
-    """A hill a joint, as high as any; limits are upright strokes, the middle 90 % a line on the ground."""
+    """Plot one histogram per joint, all of equal height. Limits are vertical lines; a bar marks the middle 90 %."""
     names = [name.removesuffix("_joint") for name in columns[0][1]["joint_names"]]
     for i, (_, figures) in enumerate(columns):
         found = figures["joints"][key]
@@ -381,7 +384,7 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
 
 
 def _motor_panels(columns: Columns) -> list[PlotPanel]:
-    """A picture a kind of joint and policy; figures that were saved before there were any have none."""
+    """One panel per kind of joint and policy. Figures from older reports may lack them."""
     rows = zip_longest(
         *([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns)
     )
@@ -411,7 +414,7 @@ def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
 
 
 def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -> None:
-    """A tile a push: ring by strength, sector by direction as the robot sees it; full where it was survived."""
+    """Plot one tile per push: ring by speed, sector by direction in the robot's frame, filled if survived."""
     survived = np.array(pushes[which])
     width = 2 * math.pi / survived.shape[1]
     rings, sectors = np.indices(survived.shape).reshape(2, -1)
@@ -457,8 +460,8 @@ def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> No
 
 
 def _reward(columns: Columns, ax: Axes) -> None:
-    """A bar a term, the largest at the top."""
-    # of either
+    """Plot one bar per reward term, the largest at the top."""
+    # the terms of both policies
     shares = {term: share or 0.0 for _, figures in reversed(columns) for term, share in figures["reward"].items()}
     terms = sorted(shares, key=lambda term: -abs(shares[term]))
     height = 0.7 / len(columns)

@@ -1,4 +1,4 @@
-"""A report on one policy or two: rolls out, gathers the figures, writes ``report.json``, ``report.html`` and a PNG a section."""
+"""The report on one or two policies: run the exam, gather the figures, write ``report.json``, ``report.html``, PNGs."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from legged_mw.sim.joints import family
 from legged_mw.sim.servos import CURVE
 from legged_mw.utils.task import LoadedTask
 
-GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # of each command, that the gait diagram and the estimate's picture show
-BEFORE_STEP = 0.5  # [s] that a step response shows before the step
+GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # [s] of each command in the gait diagram and in the estimator's plot
+BEFORE_STEP = 0.5  # [s] before the step in the plot of a step response
 
 SIGNALS: dict[str, Signal] = {
     **exam.SIGNALS,
     "contact": lambda env: env.foot_contact,  # (N, F)
     "dof_pos": lambda env: env.dof_pos,  # (N, D) [rad]
-    "dof_vel": lambda env: env.dof_vel,  # [rad/s]
-    "torque": lambda env: env.torques,  # [N m], one simulation step old
-    "motor_speed": lambda env: env.sim.actuator_velocity(),  # (N, D) [rad/s], of the same moment
-    "reward": lambda env: env.episode_sums,  # (N, K), scale * term * dt since the start
+    "dof_vel": lambda env: env.dof_vel,  # (N, D) [rad/s]
+    "torque": lambda env: env.torques,  # (N, D) [N m], one simulation step old
+    "motor_speed": lambda env: env.sim.actuator_velocity(),  # (N, D) [rad/s], of the same moment as the torque
+    "reward": lambda env: env.episode_sums,  # (N, K), sum of scale * term * dt since the start
 }
 
 
 def prepare(task: LoadedTask) -> None:
-    """Turn ``task`` into the exam, with a world for all else that a report looks at."""
+    """Turn ``task`` into the exam with the extra worlds of the report."""
     exam.prepare(task)
     make_room(task)
 
 
 def make_room(task: LoadedTask) -> None:
-    """As many worlds as the report needs; their number depends on the ranges of commands."""
+    """Set the number of worlds of the report. It depends on the command ranges."""
     task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
 
 
 def ask_alike(tasks: Sequence[LoadedTask]) -> None:
-    """Grade prepared tasks by the rules of the first, whatever ranges the others were trained with."""
+    """Grade all prepared tasks by the rules of the first, also those with other trained ranges."""
     first, *others = (rules.ExamRules.from_config(task.cfg) for task in tasks)
     for task, own in zip(tasks[1:], others, strict=True):
         if own != first:
@@ -58,9 +58,9 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
 def examine(
     env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task.
+    """The exam's result and the report's figures, from one roll-out in the environment of a prepared task.
 
-    With ``rough``, made from a task that ``crossing`` prepared, its result is among the figures.
+    ``rough``: the environment of the rough part, prepared by ``crossing``; its result joins the figures.
     """
     plan, asked = make_plan(env.cfg, env.dt), rules.ExamRules.from_config(env.cfg)
     record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=asked.worlds())
@@ -71,11 +71,12 @@ def examine(
 
 
 def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record) -> dict[str, Any]:
-    """Everything that the report shows besides the exam, as plain numbers."""
+    """All figures of the report beside the exam's result, as plain numbers."""
     parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
     settled, until = round(rules.SETTLING / env.dt), round(rules.PUSH_UNTIL / env.dt)
     held, axes, first = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
-    straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])  # the row of the grid that goes straight ahead
+    # first index of the grid's row with vy nearest to 0
+    straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])
     ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
     return {
         "joint_names": list(env.robot.joint_names),
@@ -106,7 +107,7 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
 
 
 def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
-    """Signal -> lowest and highest (D,): soft position limits, the motors' speed (infinite where not known) and torque."""
+    """Signal -> (low, high), each (D,): soft position limits, speed limits (infinite if unknown), torque limits."""
     speeds = np.array(env.robot.speed_limits)
     position = torch.stack([env.soft_lower, env.soft_upper]).cpu().numpy().astype(float)
     effort = env.robot.effort_range.T
@@ -114,7 +115,7 @@ def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]
 
 
 def motor_limits(env: LeggedRobot) -> motors.MotorLimits:
-    """Force limits and torque-speed curves; what is not known is infinite."""
+    """Force limits and torque-speed curves; infinite if unknown."""
     curve = (np.array(env.robot.tables.get(name, [np.inf] * env.num_actions)) for name in CURVE)
     return motors.MotorLimits(*env.robot.effort_range.T, *curve)
 
@@ -122,10 +123,11 @@ def motor_limits(env: LeggedRobot) -> motors.MotorLimits:
 def write(
     folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
 ) -> None:
-    """Write ``report.json``, a PNG a section and the self-contained ``report.html``.
+    """Write ``report.json``, one PNG per section and the self-contained ``report.html``.
 
-    The other columns are compared with the first, by its rules; at most two have figures. ``extras`` are further results of
-    the exam by name, such as the first policy's in another physics: the exam's table shows their gap to the first.
+    Every column is compared with the first, by the rules of the first. At most two columns have figures.
+    ``extras``: further exam results by name, such as the first policy's on another physics engine. The exam's table
+    shows their gap to the first column.
     """
     from legged_mw.eval import plots  # matplotlib takes a second to import
 

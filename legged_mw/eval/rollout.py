@@ -1,7 +1,7 @@
-"""Drives the environment through cases and records what it sees; what the cases are and what is made of a record is not here.
+"""Roll out a policy in an environment, one case per world, and record signals.
 
-One case a world: its commands, and when it is pushed. All cases run side by side, once. Exam, report and the exam during
-training differ in their cases and signals only.
+A case is a sequence of commands and an optional push. All cases run in parallel, once. The exam, the report and the
+exam during training differ only in their cases and signals.
 """
 
 from __future__ import annotations
@@ -21,43 +21,43 @@ from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget, with_own_state
 from legged_mw.sim.simulation import say_overflow
 
-Policy = Callable[[TensorDict], Tensor]  # one with a memory is an rsl-rl network
-Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)
+Policy = Callable[[TensorDict], Tensor]  # a recurrent policy is an rsl-rl network
+Signal = Callable[[Any], Tensor]  # environment -> one value per world, (N, ...)
 
 
 class Push(NamedTuple):
-    """The base's horizontal velocity jumps, after that step's action is computed and before its physics."""
+    """A jump of the base's horizontal velocity, between the action and the physics of control step ``step``."""
 
     step: int  # [control steps]
     speed: float  # [m/s]
-    angle: float  # in the world frame, from x [rad]
+    angle: float  # [rad] world frame, from the x axis
 
 
 class Case(NamedTuple):
-    """What one world is asked to do, and how it is pushed."""
+    """The commands and the push of one world."""
 
-    # from that control step on, the first of the task's table; the rest: default
+    # (first control step, values of the first commands of the task's table); further commands keep their defaults
     commands: tuple[tuple[int, tuple[float, ...]], ...]
     push: Push | None = None
 
 
 def holding(command: tuple[float, ...], push: Push | None = None) -> Case:
-    """One command throughout."""
+    """A case with one constant command."""
     return Case(((0, command),), push)
 
 
 class Record(NamedTuple):
-    """N worlds over T control steps. Signals are sampled before each step, so the first sample is the start."""
+    """N worlds over T control steps. Signals are sampled before each step, so the first sample is the start state."""
 
-    dt: float  # [s] a control step
+    dt: float  # [s] control step
     mass: float  # [kg]
-    commands: NDArray[Any]  # (T, N, C), what each world was asked for
-    fell_at: NDArray[Any]  # (N,) control step of the first fall, or inf; from there on the world is another episode
-    last_position: NDArray[Any]  # (N, 2) of the base after the last step [m]
+    commands: NDArray[Any]  # (T, N, C)
+    fell_at: NDArray[Any]  # (N,) control step of the first fall, or inf; later samples are of another episode
+    last_position: NDArray[Any]  # (N, 2) [m] of the base after the last step
     signals: dict[str, NDArray[Any]]  # name -> (T, N, ...)
 
     def part(self, worlds: slice) -> Record:
-        """The record of some of the worlds."""
+        """The record of a range of worlds."""
         signals = {name: values[:, worlds] for name, values in self.signals.items()}
         return Record(
             self.dt, self.mass, self.commands[:, worlds], self.fell_at[worlds], self.last_position[worlds], signals
@@ -72,16 +72,16 @@ def roll_out(
     signals: Mapping[str, Signal],
     alone: int | None = None,
 ) -> Record:
-    """Run each case in a world of its own for ``steps`` control steps.
+    """Run each case in its own world for ``steps`` control steps.
 
-    What is computed of the first ``alone`` worlds does not depend on how many others there are.
+    The actions of the first ``alone`` worlds do not depend on the number of further worlds.
     """
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
     timeline = _timeline(cases, steps, [command.default for command in env.command_table])
     asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
-    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
+    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer; write to a spare one
     commands.copy_(asked[0])
     obs, actor = env.first_observations(), _Actor(policy, env.num_envs, alone)
     fell_at, kept = torch.full((env.num_envs,), math.inf, device=env.device), dict[str, Tensor]()
@@ -95,7 +95,7 @@ def roll_out(
         if step in pushes:
             worlds, jumps = pushes[step]
             env.root_lin_vel[worlds, :2] += jumps
-        # the observation at the end of this step shows the next command: a second one would be a step of delay
+        # set the next command before the step, because the observation at its end must already show it
         if step + 1 < steps:
             commands.copy_(asked[step + 1])
         obs, _, dones, _ = env.step(actions)
@@ -113,7 +113,7 @@ def roll_out(
 
 
 class _Actor:
-    """A policy in all worlds. The first ``alone`` are a batch of their own: a matrix product may round differently in a larger one."""
+    """A policy for all worlds. The first ``alone`` worlds are a separate batch: rounding depends on the batch size."""
 
     def __init__(self, policy: Policy, worlds: int, alone: int | None) -> None:
         forget(policy)
@@ -122,12 +122,12 @@ class _Actor:
             self._parts.append((with_own_state(policy), slice(alone, worlds)))
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Its actions (N, A)."""
+        """The actions (N, A)."""
         with torch.inference_mode():
             return torch.cat([policy(obs[worlds]) for policy, worlds in self._parts])
 
     def believed(self, obs: TensorDict) -> dict[str, Tensor]:
-        """A further signal, "estimate", of a policy that estimates its velocity: vx, vy (N, 2) [m/s]."""
+        """The signal "estimate" of a policy with a velocity estimator: vx, vy (N, 2) [m/s]. Else empty."""
         with torch.inference_mode():
             found = [
                 value for policy, worlds in self._parts if (value := believed_velocity(policy, obs[worlds])) is not None
@@ -135,13 +135,13 @@ class _Actor:
         return {"estimate": torch.cat(found)} if found else {}
 
     def forget(self, ended: Tensor) -> None:
-        """Nothing is remembered where ``ended`` (N,)."""
+        """Reset the memory of a recurrent policy in the worlds of the mask ``ended`` (N,)."""
         for policy, worlds in self._parts:
             forget(policy, ended[worlds])
 
 
 def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> NDArray[Any]:
-    """What each world is asked for at each step, (T, N, C)."""
+    """The command of each world at each step, (T, N, C)."""
     timeline = np.tile(np.array(default, dtype=float), (steps, len(cases), 1))
     for world, case in enumerate(cases):
         for step, command in case.commands:
@@ -150,7 +150,7 @@ def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> ND
 
 
 def _pushes_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
-    """Step -> worlds (M,) and the jumps of their horizontal velocity (M, 2) [m/s, world]."""
+    """Control step -> pushed worlds (M,), and the jumps of their horizontal velocity (M, 2) [m/s, world frame]."""
     pushed, found = [(world, case.push) for world, case in enumerate(cases) if case.push], {}
     for step in {push.step for _, push in pushed}:
         now = [(world, push) for world, push in pushed if push.step == step]

@@ -1,6 +1,7 @@
-"""The walking exam's rules: what it asks, what is measured, what passes. Plain numbers: needs numpy, neither torch nor warp.
+"""The rules of the walking exam: its commands, measures and pass marks. Needs numpy, but neither torch nor warp.
 
-``exam`` applies them in the training environment, ``legged_mw.deploy`` to an exported policy. A push sets the velocity at once.
+``exam`` applies them in the training environment, ``legged_mw.deploy`` to an exported policy. A push is a jump of the
+base's velocity.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ from legged_mw.utils.commands import LABELS, VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-SECONDS, SETTLING = 10.0, 2.0  # [s] of a tracking command, and of its start that is not counted
-PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16  # [s] of the first direction; [s] survived if it still stands then
+SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command, and settling time at its start that is not measured
+# [s] time of the first push; [s] time at which the robot must still stand; number of directions
+PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16
 GRAVITY = 9.81  # [m/s^2]
-LEVELS = 10  # of each kind of rough ground
-SLOW = 0.1  # [m/s] below which a cost of transport says nothing
-EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
-# Where no config says others: pushes [m/s], the one that is to be survived, what the marks are of, and they [m/s, m/s, rad/s] if fixed.
-# A biped sways, and its step-by-step error holds the sway
+LEVELS = 10  # of each kind of rough terrain
+SLOW = 0.1  # [m/s] slowest speed with a meaningful cost of transport
+EQUAL_DRIFT = 0.005  # [m] smaller drifts count as equal
+# Defaults: push speeds [m/s], the speed that must be survived [m/s], the measure of the marks, fixed marks
+# [m/s, m/s, rad/s]. A biped sways at each step. Its error at each time contains the sway,
+# so its marks are of the offset.
 BIPED: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0), "push_mark": 1.0, "marks_of": "offset"}
 OTHERS: dict[str, Any] = {
     "push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0),
@@ -35,24 +38,24 @@ OTHERS: dict[str, Any] = {
     "marks_of": "error",
 }
 OFFSET_MARKS = (0.06, 0.06, 0.12)
-AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # vx, vy, yaw rate: name and unit
+AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # name and unit of vx, vy, yaw rate
 
 Velocity = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s]: body frame, at the IMU
 
 
 class Figure(NamedTuple):
-    """One figure of the exam beside what walking asks and what the peer, or the best of several, has."""
+    """One figure of the exam, its pass mark, and the value of the peer or of the best of several peers."""
 
     name: str
-    value: float | None  # None: there is nothing to measure
+    value: float | None  # None: not measured
     digits: int
-    mark: float | None = None  # what walking needs; None: anything
+    mark: float | None = None  # to pass as walking; None: any value
     peer: float | None = None
     more_is_better: bool = False
-    without: str = "fell"  # stands for no value
-    card: tuple[str, str] | None = None  # title and unit among the figures that one looks for first
-    equal: float = 0.0  # up to here all values count as equal
-    peer_mark: str = ""  # on the peer's value: what it means is said below the table
+    without: str = "fell"  # printed in place of None
+    card: tuple[str, str] | None = None  # title and unit, for a figure among the cards at the top of the page
+    equal: float = 0.0  # values up to this one count as equal
+    peer_mark: str = ""  # footnote mark on the peer's value
 
     def text(self, value: float | None) -> str:
         return self.without if value is None else f"{value:.{self.digits}f}"
@@ -66,13 +69,13 @@ class Figure(NamedTuple):
         return f"{self.mark:.{min(self.digits, 2 if round(self.mark, 2) == self.mark else 3)}f}"
 
     def passes(self) -> bool | None:
-        """Whether the value is what walking needs; None where it needs nothing."""
+        """Whether the value reaches the mark; None without a mark."""
         if self.mark is None:
             return None
         return self.value is not None and (self.value >= self.mark if self.more_is_better else self.value <= self.mark)
 
     def reaches_peer(self) -> bool:
-        """At or beyond the peer's."""
+        """Whether the value is as good as the peer's or better."""
         if self.value is None or self.peer is None:
             return False
         return self.value >= self.peer if self.more_is_better else self.value <= max(self.peer, self.equal)
@@ -80,20 +83,20 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class ExamRules:
-    """What the walking exam asks of one task, and what counts as walking: the config section ``exam`` without its open ends."""
+    """The commands, pushes and pass marks for one task: the config section ``exam`` with its defaults filled in."""
 
     ranges: tuple[tuple[float, float], ...]  # lowest and highest vx, vy [m/s], yaw rate [rad/s]
-    push_speeds: tuple[float, ...]  # [m/s] by which the base's horizontal velocity jumps
-    push_vx: float  # [m/s] at which the robot walks when it is pushed
-    transport_vx: float  # [m/s] at which the cost of transport is measured
-    marks: tuple[float, ...]  # largest mean error, or offset, of a policy that walks [m/s, m/s, rad/s]
-    marks_of: str = "error"  # or "offset": of the mean velocity
-    push_mark: float = 2.0  # [m/s]: a policy that walks survives all pushes of this speed
+    push_speeds: tuple[float, ...]  # [m/s] jumps of the base's horizontal velocity
+    push_vx: float  # [m/s] commanded vx during the pushes
+    transport_vx: float  # [m/s] commanded vx for the cost of transport
+    marks: tuple[float, ...]  # largest mean error or offset to pass as walking [m/s, m/s, rad/s]
+    marks_of: str = "error"  # "error" at each time, or "offset" of the mean velocity
+    push_mark: float = 2.0  # [m/s] all pushes of this speed must be survived
     peer: str = ""  # the robot's key in PEERS
 
     @classmethod
     def from_config(cls, cfg: Any) -> ExamRules:
-        """The rules for a task that walks by command. Raises ConfigError."""
+        """The rules from the config of a task with velocity commands. Raises ConfigError."""
         if not hasattr(cfg, "exam"):
             raise ConfigError(
                 "the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg"
@@ -104,10 +107,10 @@ class ExamRules:
     def from_mapping(
         cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None, feet: int = 0
     ) -> ExamRules:
-        """The rules from the fields of the config section ``exam`` or from what ``to_mapping`` returned; both may lack some.
+        """The rules from the config section ``exam`` or from ``to_mapping``. Missing fields get defaults.
 
-        ``trained``: command -> lowest and highest, where ``given`` has no range. ``feet``: how many the robot has; two make a
-        biped, which is asked less where ``given`` is silent. Raises ConfigError.
+        ``trained``: command -> (lowest, highest), for commands without a range in ``given``.
+        ``feet``: number of feet; a robot with two gets the easier defaults of a biped. Raises ConfigError.
         """
         said = {name: value for name, value in given.items() if value or name not in OTHERS}
         given = {"ranges": {}, "peer": "", **(BIPED if feet == 2 else OTHERS), **said}
@@ -125,22 +128,22 @@ class ExamRules:
         return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **kept)
 
     def to_mapping(self) -> dict[str, Any]:
-        """What ``from_mapping`` reads; it can be written as JSON or YAML."""
+        """The inverse of ``from_mapping``, with values for JSON or YAML."""
         plain = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
         return {**plain, "ranges": {name: list(ends) for name, ends in zip(VELOCITY, self.ranges, strict=True)}}
 
     @property
     def peers(self) -> list[Peer]:
-        """The published policies of the robot that were asked the same."""
+        """The published policies of the robot that were measured by the same commands and pushes."""
         return [peer for peer in PEERS.get(self.peer, []) if peer.fits(self)]
 
     @property
     def peer_label(self) -> str:
-        """What stands above the peer's figures, or above the best of several peers; empty if there is none."""
+        """The heading above the figures of the peer or of the best of several peers; empty without peers."""
         return f"best of {len(self.peers)}" if len(self.peers) > 1 else "peer" * len(self.peers)
 
     def asked_words(self) -> str:
-        """The ranges that are asked."""
+        """The command ranges as text."""
         spans = [
             f"{name} {low:g} to {high:g} {unit}" for (name, unit), (low, high) in zip(AXES, self.ranges, strict=True)
         ]
@@ -152,7 +155,7 @@ class ExamRules:
         return f"asked: {', '.join(spans)}{common}"
 
     def peer_words(self) -> str:
-        """Who the peers are, and what of their figures was asked otherwise; empty if there is none."""
+        """The peers as text, with the figures that were measured in another way; empty without peers."""
         if not self.peers:
             return ""
         first = self.peers[0]
@@ -168,7 +171,7 @@ class ExamRules:
         ).strip()
 
     def commands(self) -> list[Velocity]:
-        """The 22 commands; the first is to stand."""
+        """The 22 commands; the first is standing."""
         (x0, x1), (y0, y1), (w0, w1) = self.ranges
         along = [(v, 0.0, 0.0) for v in (x1 / 3, 2 * x1 / 3, x1, x0 / 3, 2 * x0 / 3)]
         across = [(0.0, v, 0.0) for v in (y1 / 2, y1, y0 / 2, y0)]
@@ -178,12 +181,12 @@ class ExamRules:
         return [(round(vx, 4), round(vy, 4), round(yaw, 4)) for vx, vy, yaw in every]
 
     def held(self) -> list[Velocity]:
-        """The commands that a world each holds: the 22, and that of the cost of transport if it is none of them."""
+        """The constant commands, one per world: the 22, and that of the cost of transport unless it is one of them."""
         ahead = (self.transport_vx, 0.0, 0.0)
         return self.commands() if ahead in self.commands() else [*self.commands(), ahead]
 
     def worlds(self) -> int:
-        """One a held command, then one a push: speeds x directions."""
+        """The number of worlds: one per constant command and one per push (speeds x directions)."""
         return len(self.held()) + len(self.push_speeds) * PUSH_DIRECTIONS
 
     def grade(
@@ -195,19 +198,20 @@ class ExamRules:
         mass: float,
         dt: float,
     ) -> dict[str, Any]:
-        """The exam's result from samples of its N worlds before each of T control steps of ``dt`` [s].
+        """The exam's result from samples of N worlds, taken before each of T control steps of ``dt`` [s].
 
-        ``signals``: velocity (T, N, 3) [m/s, m/s, rad/s]; position (T, N, 2) [m]; power (T, N), the sum of |torque * joint speed|
-        [W]; joint_speed (T, N), the mean over the joints [rad/s]; of a policy that estimates its velocity, estimate (T, N, 2) [m/s].
-        ``last_position`` (N, 2) after the last step [m];
-        ``fell_at`` (N,): control step of the first fall, or inf; ``mass`` [kg].
+        ``signals``: velocity (T, N, 3) [m/s, m/s, rad/s]; position (T, N, 2) [m]; power (T, N) [W], the sum of
+        |torque * joint speed|; joint_speed (T, N) [rad/s], the mean over the joints; estimate (T, N, 2) [m/s], only for a
+        policy with a velocity estimator.
+        ``last_position`` (N, 2) [m]: after the last step. ``fell_at`` (N,): control step of the first fall, or inf.
+        ``mass`` [kg].
         """
         velocity, position, power, joint_speed = (
             signals[name] for name in ("velocity", "position", "power", "joint_speed")
         )
         commands, held, settled = self.commands(), self.held(), round(SETTLING / dt)
         ahead, stood = held.index((self.transport_vx, 0.0, 0.0)), np.isinf(fell_at)
-        distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # a straight line
+        distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # along a straight line
         energy = power[settled:, ahead].sum(dtype=float) * dt
         moved = stood[ahead] and distance[ahead] > SLOW * (len(velocity) - settled) * dt
         survived = (fell_at[len(held) :] > round(PUSH_UNTIL / dt)).reshape(-1, PUSH_DIRECTIONS).mean(axis=1)
@@ -230,23 +234,23 @@ class ExamRules:
         return {"walks": self.walks(result), **beats, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
-        """No falls, small errors (or offsets), every push of the mark's speed survived."""
+        """Whether the policy walks: no falls, errors (or offsets) within the marks, all pushes of the mark survived."""
         if result["falls"]:
             return False
         small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
         return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
     def beats_peer(self, result: Mapping[str, Any]) -> bool:
-        """At least as good on each figure of each peer, better on the errors and the cost of transport."""
+        """Whether the result is as good as each peer on every figure, and better on errors and cost of transport."""
         return all(_beats(result, peer.figures) for peer in self.peers)
 
     def reached(self, result: Mapping[str, Any]) -> tuple[int, int]:
-        """In how many figures the result is at or beyond the peers' best, and of how many."""
+        """The number of figures that are as good as the peers' best or better, and the number of compared figures."""
         compared = [figure for figure in self.figures(result) if figure.peer is not None]
         return sum(figure.reaches_peer() for figure in compared), len(compared)
 
     def figures(self, result: Mapping[str, Any], others: Sequence[Mapping[str, Any]] = ()) -> list[Figure]:
-        """The result's figures in the order of the table, with a line for what only ``others`` have that stand beside it."""
+        """The figures of the result in the order of the table, with a row for each figure that only ``others`` have."""
         peer, unknown_of_peer = best_of(self.peers), (None, None, None)
         apart = "*" if any(peer.own_speed for peer in self.peers) else ""
         listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
@@ -289,9 +293,9 @@ class ExamRules:
 
 
 def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
-    """How well C commands were followed: from the velocities (T, C, 3), and which worlds did not fall (C,).
+    """The tracking errors of C commands, from the velocities (T, C, 3) and the worlds that did not fall (C,).
 
-    One that fell has the error of standing still, so that no policy gains by falling at what it does worst.
+    A world that fell gets the error of standing still, so that a fall at a hard command does not improve the mean.
     """
     asked = np.array(commands)
     difference = velocity - asked
@@ -310,7 +314,7 @@ def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[A
 
 
 def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
-    """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
+    """Whether the result is as good as the peer on every figure, and better on errors and cost of transport."""
     if result["falls"] > peer["falls"]:
         return False
     better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))
@@ -325,7 +329,7 @@ def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
 
 
 def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> None:
-    """Raises ConfigError for rules that cannot be applied."""
+    """Raise ConfigError for rules that cannot be applied."""
     for name in given["ranges"]:
         if name not in VELOCITY:
             raise ConfigError(
@@ -344,9 +348,9 @@ def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> N
 
 
 def in_common(peer: str) -> dict[str, Any]:
-    """Fields of the config section ``exam`` that ask the range which all published policies of the robot ``peer`` were asked.
+    """Fields of the config section ``exam`` with the common command range of the published policies of ``peer``.
 
-    Raises ConfigError if there is none.
+    Raises ConfigError if the robot has no common range.
     """
     if (robot := robot_of(peer)) not in COMMON:
         raise ConfigError(
@@ -357,7 +361,7 @@ def in_common(peer: str) -> dict[str, Any]:
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """The result as text, beside what walking asks and what the peer, or the best of several, has if there is one."""
+    """The result as text, with the pass marks and the values of the peer or of the best of several peers."""
     rules = ExamRules.from_mapping(result["rules"])
     label = rules.peer_label
     width = max(8, len(label) + 2) if label else 0
@@ -374,7 +378,7 @@ def table(result: Mapping[str, Any]) -> str:
 
 
 def verdicts(rules: ExamRules, result: Mapping[str, Any]) -> list[tuple[str, bool]]:
-    """What is said of a result, and whether it is so."""
+    """The verdicts on a result, each with true or false."""
     several, (reached, count) = len(rules.peers) > 1, rules.reached(result)
     beats = f"beats all {len(rules.peers)} published policies (at or beyond their best in {reached} of {count} figures)"
     words = {"walks": "walks", "beats_peer": beats if several else "beats the peer"}

@@ -1,7 +1,7 @@
-"""Exams of tasks without commands: robots are put into a start, the policy acts, and what was recorded is judged.
+"""Exams of tasks without commands: set the start states, run the policy, judge the recording.
 
-A kind of exam is a ``Skill``. The same object judges the robots of the training environment and those of an export: it needs
-numpy and MuJoCo, neither torch nor warp.
+Each kind of exam is a ``Skill``. The same object judges the training environment and an exported policy. It needs
+numpy and MuJoCo, but neither torch nor warp.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -21,20 +21,23 @@ from numpy.typing import NDArray
 from legged_mw.eval.rules import Figure
 
 Floats = NDArray[np.float64]
-PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] directions that never repeat
+PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] golden angle: directions that never repeat
 Starts = tuple[Floats, Floats]  # qpos (N, nq), qvel (N, nv)
 
 
 class ExamGround(NamedTuple):
-    """What is another than in the task as it was trained, without randomization."""
+    """The changes of one part of the exam to the trained task without randomization."""
 
-    slope: float = 0.0  # [deg] of the plane; in simulation gravity leans and the plane stays
-    friction: float | None = None  # [-] of the ground; None: the task's
-    load: float = 0.0  # [kg] on the root
-    push: float = 0.0  # [m/s] by which each robot's horizontal velocity jumps, every PUSH_EVERY seconds
+    slope: float = 0.0  # [deg] of the plane; simulated by tilting gravity
+    friction: float | None = None  # [-] of the ground; None: as in the task
+    load: float = 0.0  # [kg] payload on the root body
+    push: float = 0.0  # [m/s] jump of each robot's horizontal velocity, every PUSH_EVERY seconds
 
     def pushes(self, step: int, count: int, dt: float) -> Floats | None:
-        """Jumps (count, 2) [m/s] at a control step of ``dt`` [s]; None: none. Robots are pushed one after another, in all directions."""
+        """Velocity jumps (count, 2) [m/s] at a control step of ``dt`` [s], or None.
+
+        Robots are pushed one after another, in all directions.
+        """
         every, robots = round(PUSH_EVERY / dt), np.arange(count)
         now = (step > 0) & ((step + robots * every // count) % every == 0)
         if not self.push or not now.any():
@@ -44,36 +47,36 @@ class ExamGround(NamedTuple):
 
 
 class ReferenceMotion(NamedTuple):
-    """What a robot is to follow."""
+    """The reference motion of a tracking exam."""
 
-    qpos: Floats  # (T, nq) a frame a control step
-    bodies: tuple[str, ...]  # that are compared
-    anchor: str  # one of them, at which they are
+    qpos: Floats  # (T, nq) one frame per control step
+    bodies: tuple[str, ...]  # bodies to compare with the reference
+    anchor: str  # the body at which robot and reference are aligned
 
 
 class ExamRobot(NamedTuple):
-    """The machine that an exam is about."""
+    """The robot of an exam."""
 
-    model: mujoco.MjModel  # as it is stepped, with the gravity of the exam's ground
-    home: Floats  # (nq,) where an episode starts, joints in their default pose
+    model: mujoco.MjModel  # model of the simulation, with the gravity of the exam's ground
+    home: Floats  # (nq,) qpos at the start of an episode, joints in the default pose
     dt: float  # [s] a control step
     motion: ReferenceMotion | None = None
 
 
 class Recording(NamedTuple):
-    """N robots over T control steps, sampled before each step, so that the first sample is the start."""
+    """N robots over T control steps, sampled before each step: the first sample is the start state."""
 
-    qpos: Floats  # (T, N, nq) [m, world], quaternion wxyz, joint angles [rad]
+    qpos: Floats  # (T, N, nq) position [m, world frame], quaternion wxyz, joint angles [rad]
     qvel: Floats  # (T, N, nv)
     torque: Floats  # (T, N, D) [N m], one simulation step old
-    ended_at: Floats  # (N,) control step in which the episode ended first, or inf; from there on it is another one
+    ended_at: Floats  # (N,) control step of the first end of an episode, or inf; later samples are of another one
 
 
 class Measure(NamedTuple):
-    """A figure of each part of an exam, and what it must be on the task's own ground and on any other."""
+    """A figure of each part of an exam, with its pass marks on the task's own ground and on other grounds."""
 
     key: str
-    text: str  # with its unit
+    text: str  # label with unit
     digits: int = 3
     marks: tuple[float, float] | None = None
     more_is_better: bool = True
@@ -81,41 +84,41 @@ class Measure(NamedTuple):
 
 @dataclass(frozen=True)
 class Skill(ABC):
-    """One kind of exam. Its fields are those of the task's config section ``exam``, if it has one."""
+    """One kind of exam. Its fields are the fields of the task's config section ``exam``."""
 
     kind: ClassVar[str]
-    asks: ClassVar[str]  # one sentence for the table
-    grounds: ClassVar[Mapping[str, ExamGround]]  # parts of the exam; the first is also the exam during training
-    robots: ClassVar[int]  # of each part
+    asks: ClassVar[str]  # description for the table, one sentence
+    grounds: ClassVar[Mapping[str, ExamGround]]  # part -> ground; the first part is also the exam during training
+    robots: ClassVar[int]  # in each part
     measures: ClassVar[Sequence[Measure]]
-    overrides: ClassVar[Mapping[str, Any]] = {}  # config fields, beside those that every exam sets (exam.OVERRIDES)
+    overrides: ClassVar[Mapping[str, Any]] = {}  # config fields, in addition to exam.OVERRIDES
 
     @property
     @abstractmethod
     def seconds(self) -> float:
-        """How long robots are watched [s]."""
+        """Duration of a recording [s]."""
 
     def steps(self, robot: ExamRobot) -> int:
-        """How long [control steps]."""
+        """Duration of a recording [control steps]."""
         return round(self.seconds / robot.dt)
 
     @abstractmethod
     def starts(self, robot: ExamRobot, count: int) -> Starts | None:
-        """qpos (count, nq) and qvel (count, nv) to begin with, the same at every call; None: where the task's episodes begin."""
+        """Start states qpos (count, nq) and qvel (count, nv), equal at every call. None: as the task's episodes."""
 
     @abstractmethod
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
-        """A value for each of ``measures``; None where there is nothing to measure. Other keys are kept too."""
+        """A value for each of ``measures``, or None if it cannot be measured. The result keeps further keys."""
 
     def result(self, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """The exam's result from what ``judge`` said of each part, for JSON."""
+        """The exam's result, for JSON, from the return value of ``judge`` for each part."""
         asked = {"kind": self.kind, **asdict(self)}
         found = {name: {key: _plain(value) for key, value in part.items()} for name, part in parts.items()}
         passed = all(figure.passes() is not False for part in found for figure in self.figures(found, part))
         return {"asked": asked, "robots": self.robots, "parts": found, "passed": passed}
 
     def figures(self, parts: Mapping[str, Mapping[str, Any]], part: str) -> list[Figure]:
-        """The figures of one part beside their marks."""
+        """The figures of one part with their marks."""
         first = part == next(iter(self.grounds))
         return [
             Figure(
@@ -130,7 +133,7 @@ class Skill(ABC):
         ]
 
     def table(self, result: Mapping[str, Any]) -> str:
-        """The result as text: a row a figure, a column a part."""
+        """The result as text: one row per figure, one column per part."""
         parts = result["parts"]
         columns = [self.figures(parts, name) for name in parts]
         width = max(10, *(len(name) + 2 for name in parts))

@@ -1,4 +1,4 @@
-"""The report on an exam of the kind ``skill`` as one page: tables and strips of pictures in, HTML out."""
+"""The report on a skill exam as one HTML page, from tables and picture strips."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from legged_mw.eval.skill import Skill
 
 
 def html(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str, bytes]) -> str:
-    """The whole page; ``strips`` are PNGs by the part whose slowest robot, or one that failed, they show."""
+    """The whole page. ``strips``: part -> PNG of a robot that failed, else of the slowest robot."""
     passed = [f"<li><b>{escape(c.name)}</b> {pill('passes', 'does not pass', c.exam['passed'])}</li>" for c in columns]
     sections = []
     for part in skill.grounds:
@@ -30,5 +30,5 @@ def html(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str
 
 
 def picture(png: bytes, name: str) -> str:
-    """The robot that failed, or was the slowest."""
+    """The HTML of one picture strip."""
     return f'<p><img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt="{escape(name)}" style="max-width:100%"></p>'

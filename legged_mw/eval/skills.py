@@ -1,4 +1,4 @@
-"""The kinds of exam of tasks without commands, by name. As ``skill``, it needs neither torch nor warp."""
+"""The exams of tasks without commands, by name. Needs neither torch nor warp."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One robot of an exam as a strip of pictures: what it did, side by side in time."""
+"""A picture strip of one robot in an exam, from left to right in time."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from legged_mw.view.recorder import RobotRenderer
 from legged_mw.view.stage import Moment
 from legged_mw.view.video import contact_sheet, save_png
 
-PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, of them in a row, [px] of each
+PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, pictures per row, [px] of each
 
 
 def strip(env: RobotTask, qpos: Floats) -> bytes:
-    """A PNG of the robot at PICTURES times, evenly spaced over ``qpos`` (T, nq). Raises ViewError where nothing can be drawn."""
+    """A PNG of the robot at PICTURES times, evenly spaced over ``qpos`` (T, nq). Raises ViewError if drawing fails."""
     renderer, none = RobotRenderer(visual_spec(env.robot, env.cfg.viewer.camera), WIDTH, HEIGHT), np.zeros((1, 3))
     frames = []
     for step in np.linspace(0, len(qpos) - 1, PICTURES).round().astype(int):
         lines = ((f"{step * env.dt:.1f} s", ""),)
-        there = np.concatenate([qpos[0, :2], qpos[step, 2:]])  # the camera would be left behind
+        there = np.concatenate([qpos[0, :2], qpos[step, 2:]])  # keep x and y at the start, in view of the camera
         moment = Moment(
             step * env.dt, there[None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines
         )

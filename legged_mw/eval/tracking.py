@@ -1,4 +1,4 @@
-"""The exam of tasks that follow a motion: the whole first clip from its start, with and without pushes."""
+"""The exam of motion tracking: follow the whole first clip from its start, with and without pushes."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -12,15 +12,16 @@ import numpy as np
 from legged_mw.eval.skill import ExamGround, ExamRobot, Floats, Measure, Recording, Skill
 from legged_mw.skills.clip import conjugate, from_rotation_vector, heading, multiply, rotate
 
-JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1  # [rad], [rad], [m/s] of a robot at the start, U(-off, off)
-# [BeyondMimic] of the anchor against its reference, beyond which a robot does not follow any more
+# Offsets of a robot at the start: joint angles [rad], heading [rad], speed [m/s], each U(-off, off).
+JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1
+# [m], [-] Errors of the anchor's height and tilt at which a robot is lost. Source: BeyondMimic.
 LOST_HEIGHT, LOST_TILT = 0.25, 0.8
-FAR = 1e9  # of the task's own rules, which the exam does not use: the exports know none of them
+FAR = 1e9  # switches off the task's termination rules, because exported policies do not have them
 
 
 @dataclass(frozen=True)
 class TrackingExam(Skill):
-    """Does it follow the clip to its end, and how closely?"""
+    """Does the robot follow the clip to its end, and how closely?"""
 
     kind = "tracking"
     asks = "The whole clip from its start, by 32 robots that begin a little off it; pushed ones get 0.5 m/s every 2 s."
@@ -39,7 +40,7 @@ class TrackingExam(Skill):
 
     @property
     def seconds(self) -> float:
-        return 0.0  # it is the clip that says: see `steps`
+        return 0.0  # the clip sets the duration; see `steps`
 
     def steps(self, robot: ExamRobot) -> int:
         assert robot.motion
@@ -77,7 +78,7 @@ class TrackingExam(Skill):
         drift = np.linalg.norm((found - wanted)[-1, last, anchor, :2], axis=1)
         return {
             "finished": float(last.mean()),
-            # the robot that was lost first, else the least exact
+            # the robot that was lost first, else the one with the largest error
             "worst": int(np.argmax(np.where(last, own, FAR - kept))),
             "body_error": float(1000.0 * error[follows].mean()) if follows.any() else None,
             "joint_error": float(joints[follows].mean()) if follows.any() else None,
@@ -86,7 +87,7 @@ class TrackingExam(Skill):
 
 
 def _posed(model: mujoco.MjModel, qpos: Floats, bodies: list[int]) -> tuple[Floats, Floats]:
-    """Places (..., B, 3) [m] and attitudes (..., B, 4) of ``bodies`` in the states ``qpos`` (..., nq)."""
+    """Positions (..., B, 3) [m] and quaternions wxyz (..., B, 4) of ``bodies`` in the states ``qpos`` (..., nq)."""
     data, flat = mujoco.MjData(model), qpos.reshape(-1, qpos.shape[-1])
     places, turns = np.full((len(flat), len(bodies), 3), np.nan), np.full((len(flat), len(bodies), 4), np.nan)
     for i in np.flatnonzero(np.isfinite(flat).all(axis=1)):

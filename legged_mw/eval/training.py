@@ -1,4 +1,4 @@
-"""The walking exam during training: few worlds, few seconds, in an environment of its own; training does not notice it."""
+"""A short walking exam during training, in a separate environment. It does not change the training run."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from legged_mw.eval.rollout import Policy, Record, roll_out
 from legged_mw.eval.rules import ExamRules
 from legged_mw.utils.task import LoadedTask, load_task
 
-SECONDS, SETTLING = 4.0, 2.0  # [s] of a roll-out, and of its start in which no error is counted
-PUSH_AT = 1.0  # [s] of the first of 16 directions; survived if it still stands at the end
+SECONDS, SETTLING = 4.0, 2.0  # [s] duration of the roll-out, and settling time at its start without error measurement
+PUSH_AT = 1.0  # [s] time of the first of 16 pushes; a push is survived if the robot stands at the end
 
 
 class TrainingExam:
-    """The 22 commands and the 16 pushes that walking must survive, 4 s each; called with a policy it gives figures by name.
+    """The 22 commands and the 16 pushes at ``push_mark``, 4 s each. A call with a policy returns figures by name.
 
-    The environment is made from a copy of the task, so what was overridden for training counts here too. Random numbers
-    are drawn in it, and the generators are put back afterwards: training goes on as if nothing had been.
+    The environment is made from a copy of the task, with the overrides of the training run. The random generators are
+    restored after each exam, so training continues unchanged.
     """
 
     def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
@@ -36,7 +36,7 @@ class TrainingExam:
     def __call__(self, policy: Policy) -> dict[str, float]:
         """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]; ``falls`` of 22; ``pushes_survived``, a share.
 
-        Of a policy that estimates its velocity also ``estimate_vx``, ``estimate_vy`` [m/s], root mean square errors.
+        For a policy with a velocity estimator also its RMS errors ``estimate_vx``, ``estimate_vy`` [m/s].
         """
         dt = self.env.dt
         with torch.random.fork_rng(self._generators):
@@ -46,9 +46,9 @@ class TrainingExam:
 
 
 def training_figures(record: Record, count: int) -> dict[str, float]:
-    """The figures of a record whose first ``count`` worlds hold a command and whose others are pushed.
+    """The figures of a record. Its first ``count`` worlds have constant commands, the others are pushed.
 
-    A command at which it fell has the error of standing still.
+    A world that fell gets the error of standing still.
     """
     settled, stood = round(SETTLING / record.dt), np.isinf(record.fell_at)
     asked = record.commands[settled:, :count, :3]

@@ -1,1 +1,1 @@
-"""Reference motions: other programs' files in, checked, resampled, looked at. The format is in ``legged_mw.skills.clip``."""
+"""Reference motions: read files of other programs, check, resample and play them. Format: ``legged_mw.skills.clip``."""

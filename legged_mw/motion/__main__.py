@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def convert(clip: Clip, args: argparse.Namespace) -> Clip:
-    """``clip`` as the flags ask for it."""
+    """``clip`` after the changes of the flags."""
     clip = clip.at(args.rate)
     if args.cut:
         first, last = (round(seconds * clip.fps) for seconds in args.cut)
@@ -73,7 +73,7 @@ def convert(clip: Clip, args: argparse.Namespace) -> Clip:
 
 
 def feet_of(robot: RobotModel) -> list[str]:
-    """Geoms that touch the ground."""
+    """The geoms of the robot's feet."""
     model = robot.physics
     return [model.geom(g).name for g in range(model.ngeom) if model.geom_bodyid[g] and model.geom_conaffinity[g]]
 

@@ -1,4 +1,4 @@
-"""Motions as others write them: Unitree-style CSV, and the .npz of BeyondMimic and mjlab."""
+"""Read motions of other programs: Unitree-style CSV, and the .npz of BeyondMimic and mjlab."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -16,12 +16,12 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.skills.clip import KEYS, Clip, ClipError, checked, clip_of
 from legged_mw.utils.files import read_arrays
 
-CSV_FPS = 30.0  # of LAFAN1 as retargeted by Unitree
-APART = 0.02  # [m] between the bodies of a file and ours, at most
+CSV_FPS = 30.0  # of the LAFAN1 motions retargeted by Unitree
+APART = 0.02  # [m] largest accepted distance between the bodies of a file and ours
 
 
 def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip:
-    """The motion in ``path``, a .csv or .npz, for ``robot``. ``fps``: frames a second of a file that does not say. Raises ClipError."""
+    """The motion in ``path``, a .csv or .npz, for ``robot``. ``fps``: for a file without one. Raises ClipError."""
     if path.suffix.lower() == ".csv":
         return _read_csv(path, robot, CSV_FPS if fps is None else fps)
     if path.suffix.lower() != ".npz":
@@ -38,10 +38,10 @@ def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip
 
 
 def _read_csv(path: Path, robot: RobotModel, fps: float) -> Clip:
-    """A line a frame: root x, y, z [m], quaternion x, y, z, w, then the joints [rad] in the order of the robot's file."""
+    """One line per frame: root x, y, z [m], quaternion x, y, z, w, joints [rad] in the order of the robot's file."""
     try:
         lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.partition("#")[0].strip()]
-        if lines and not _is_number(lines[0].split(",")[0]):  # names
+        if lines and not _is_number(lines[0].split(",")[0]):  # a header with names
             del lines[0]
         if not lines:
             raise ValueError("it holds none")
@@ -66,7 +66,7 @@ def _is_number(text: str) -> bool:
 
 
 def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: float | None) -> Clip:
-    """Joints without names, and the places of all bodies: the order of joints is the one that puts the bodies there."""
+    """Joint angles without names, and the positions of all bodies: find the joint order that matches the positions."""
     for key in ("joint_pos", "body_pos_w", "body_quat_w"):
         if key not in held:
             raise ClipError(
@@ -95,7 +95,7 @@ def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: fl
 
 
 def breadth_first(robot: RobotModel) -> list[str]:
-    """The joints as Isaac Lab has them: all that are one body away from the root, then all that are two, and so on."""
+    """The joints in the order of Isaac Lab: breadth first from the root."""
     model, depth = robot.physics, {}
     for name in robot.joint_names:
         body, far = int(model.joint(name).bodyid[0]), 0
@@ -106,7 +106,7 @@ def breadth_first(robot: RobotModel) -> list[str]:
 
 
 def _apart(robot: RobotModel, clip: Clip, places: np.ndarray, frame: int) -> float:
-    """How far the farthest body of the file is from the nearest one of ours [m]."""
+    """The largest distance [m] from a body of the file to the nearest of our bodies."""
     model: mujoco.MjModel = robot.physics
     ours = posed(model, clip.joint_pos[frame], clip.qpos()[frame, :7]).xpos[1:]
     return float(np.linalg.norm(places[frame][:, None] - ours[None], axis=2).min(axis=1).max())

@@ -1,4 +1,4 @@
-"""A clip on a robot: what is wrong with it, and a stage that plays it in the viewers."""
+"""Check a clip on a robot, and play it as a stage in the viewers."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -16,13 +16,13 @@ from legged_mw.skills.clip import Clip, Floats
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
 
-DEEP, NEAR = 0.01, 0.005  # [m] below the ground that is too much; up to where a foot counts as standing
-SLIDING = 0.1  # [m/s] of a standing foot that is too much
-BEYOND = 1e-3  # [rad] beyond a joint's range that is too much
+DEEP, NEAR = 0.01, 0.005  # [m] largest accepted depth below the ground; largest height of a standing foot
+SLIDING = 0.1  # [m/s] largest accepted speed of a standing foot
+BEYOND = 1e-3  # [rad] largest accepted excess over a joint's limits
 
 
 def page(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> str:
-    """What the clip is, and what of it a robot cannot do. ``feet``: geoms that touch the ground."""
+    """A summary of the clip, and its faults on this robot. ``feet``: geoms of the feet."""
     speed = np.abs(clip.qvel()[:, 6:])
     fastest = int(speed.max(axis=0).argmax())
     lines = [
@@ -41,7 +41,7 @@ def page(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> str:
 
 
 def wrong(robot: RobotModel, clip: Clip, lowest: float, slide: float) -> list[str]:
-    """A line for each thing that a robot cannot do."""
+    """The faults of the clip, one line each."""
     found, (low, high) = [], robot.joint_range.T
     beyond = np.maximum(low - clip.joint_pos, clip.joint_pos - high)
     for joint in np.flatnonzero(beyond.max(axis=0) > BEYOND):
@@ -61,7 +61,7 @@ def _when(clip: Clip, values: Floats) -> str:
 
 
 def _feet(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> tuple[Floats, Floats]:
-    """Heights (T, bodies) of the lowest point of each foot [m], and the fastest standing foot (T,) [m/s]."""
+    """The height of each foot's lowest point (T, bodies) [m], and the speed of the fastest standing foot (T,) [m/s]."""
     model, data, heights, places = robot.physics, mujoco.MjData(robot.physics), [], []
     geoms = [robot.id("geom", name) for name in feet]
     bodies, points = (
@@ -83,7 +83,7 @@ def _feet(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> tuple[Floats, F
 
 
 class ClipStage:
-    """A clip as a stage: one robot that is placed, not stepped; see ``view.stage.Stage``. At its end the clip begins again."""
+    """A clip as a stage: one robot, posed without physics; see ``view.stage.Stage``. The clip repeats at its end."""
 
     command_table: tuple[Command, ...] = ()
     num_worlds = 1

@@ -1,1 +1,1 @@
-"""A robot's health page: what it weighs, what its servos bear, how it stands, and a task to begin with."""
+"""A robot's health page: mass, servo stability, standing test; and a first task for a new robot."""

@@ -43,7 +43,7 @@ def main() -> None:
         show_task(load_task(args.file, say=True), image)
         return
     if args.new:
-        # refused before the page, not after it
+        # refuse before the page, not after it
         new.targets(args.new, writable(args.out, "--out", folder=True), args.force)
     found = draft(file)
     env = as_env(found, file)
@@ -55,13 +55,13 @@ def main() -> None:
 
 
 def show_task(task: LoadedTask, image: Path | None) -> None:
-    """Print the page of a task's robot, one on a plane; draw it to ``image``."""
+    """Print the page of a task's robot on a plane, and draw it to ``image``."""
     env, rough = few_robots(task)
     show(env, task.name, image, rough=rough)
 
 
 def show(env: RobotTask, title: str, image: Path | None, found: Draft | None = None, rough: bool = False) -> None:
-    """Print the page, with what was guessed if the task is a draft; then draw the picture. Room is that of ``rough`` ground."""
+    """Print the page and draw the picture. ``found``: a draft, to list its guesses. ``rough``: on rough terrain."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
     health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation, rough)
     print(page(health, title, found.guessed, found.notes) if found else page(health, title), flush=True)

@@ -25,14 +25,15 @@ from legged_mw.utils.errors import UserError
 from legged_mw.utils.files import writable
 from legged_mw.utils.motor_network import ACTIVATIONS, MotorNetwork
 
-_STEPS, _JOINTS = 12, 64  # of the comparison
-_TOLERANCE = 1e-4  # of the largest torque
+_STEPS, _JOINTS = 12, 64  # size of the comparison
+_TOLERANCE = 1e-4  # share of the largest torque
 
 
 def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[MotorNetwork, float]:
-    """The network in ``file`` and how far its torques are from the file's, as a share of the largest one.
+    """The network in ``file``, and the error of its torques against the file, as a share of the largest torque.
 
-    ``frames`` (empty: the last few simulation steps) and ``layout``, in_turns and scales, are how the file is fed. Raises UserError.
+    ``frames`` (empty: the last few simulation steps) and ``layout`` (in_turns, scales) describe the input of the file.
+    Raises UserError.
     """
     try:
         module = torch.jit.load(str(file), map_location="cpu").eval()
@@ -64,7 +65,7 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
 
 
 def _layers(state: dict[str, Any], file: Path) -> MotorNetwork:
-    """LSTM layers by their names in torch, all other matrices as linear layers, in order."""
+    """Read LSTM layers by their names in torch, and all other matrices as linear layers in order."""
     recurrent, linear = [], []
     while ends := [name for name in state if name.endswith(f"weight_ih_l{len(recurrent)}")]:
         prefix, layer = ends[0].removesuffix(f"weight_ih_l{len(recurrent)}"), len(recurrent)
@@ -84,13 +85,13 @@ def _layers(state: dict[str, Any], file: Path) -> MotorNetwork:
 
 
 def _states() -> Any:
-    """Errors [rad] and speeds [rad/s] (T, 2, J) of joints, as a walking robot has them."""
+    """Typical joint errors [rad] and speeds [rad/s] of a walking robot, (T, 2, J)."""
     spread = np.array([[0.3], [3.0]])
     return (spread * np.random.default_rng(0).standard_normal((_STEPS, 2, _JOINTS))).astype(np.float32)
 
 
 def _theirs(module: Any, fed: MotorNetwork, states: Any) -> Any:
-    """Torques (T, J) that the file makes of ``states``."""
+    """The file's torques (T, J) for ``states``."""
     past, torques = np.zeros((fed.frames[-1] + 1, 2, _JOINTS), dtype=np.float32), []
     memory = (torch.zeros(len(fed.hidden), _JOINTS, fed.hidden[0]),) * 2 if fed.hidden else None
     for now in states:
@@ -105,7 +106,7 @@ def _theirs(module: Any, fed: MotorNetwork, states: Any) -> Any:
 
 
 def _fit(network: MotorNetwork, states: Any, wanted: Any) -> tuple[MotorNetwork, float]:
-    """``network`` with the scales that a file may have inside of it, too, and what is left as a share of the largest torque."""
+    """``network`` with the scales that the file may apply inside, and the error as a share of the largest torque."""
 
     def ours(factors: Any) -> tuple[MotorNetwork, Any]:
         scaled = replace(
@@ -119,7 +120,7 @@ def _fit(network: MotorNetwork, states: Any, wanted: Any) -> tuple[MotorNetwork,
         return scaled, np.array(torques)
 
     def left(logs: Any) -> tuple[MotorNetwork, Any]:
-        """With the best factor on the torque, which is linear."""
+        """The network and its error with the best torque scale, by linear least squares."""
         scaled, torques = ours(np.exp(logs))
         factor = float((torques * wanted).sum() / max((torques * torques).sum(), 1e-12))
         return replace(scaled, torque_scale=scaled.torque_scale * factor), (factor * torques - wanted).ravel()
@@ -132,7 +133,7 @@ def _fit(network: MotorNetwork, states: Any, wanted: Any) -> tuple[MotorNetwork,
         (np.array(logs) for logs in product(np.log([0.03, 0.1, 0.3, 1.0, 3.0, 10.0]), repeat=2)),
         key=lambda x: _norm(left(x)[1]),
     )
-    for _ in range(30):  # Gauss and Newton, with half a step where a whole one is worse
+    for _ in range(30):  # Gauss-Newton, with step halving
         here = left(best)[1]
         slopes = np.stack([(left(best + step)[1] - here) / 1e-2 for step in 1e-2 * np.eye(2)], axis=1)
         move = -np.linalg.lstsq(slopes, here, rcond=None)[0]
@@ -146,7 +147,7 @@ def _norm(residual: Any) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Convert one file."""
+    """Convert one file to .npz."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="the torchscript file")
     parser.add_argument("out", type=Path, help="the .npz to write")

@@ -1,7 +1,8 @@
-"""A pose to stand in for a robot whose file has none: knees bent, each foot under its hip, soles as they were.
+"""A default pose for a robot file without one: bent knees, each foot under its hip, level soles.
 
-A leg that stands straight cannot push, and its servos cannot tell which way to bend. A leg is taken to bend at its first two joints
-about the sideways axis, hip and knee, and to be straight with both at 0; a third one, the ankle, keeps the sole level.
+A straight leg cannot push, and its servos have no preferred direction to bend. The first two joints of a leg about the
+sideways axis are assumed to be hip and knee, and the leg to be straight with both at 0. A third one, the ankle, keeps
+the sole level.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -18,17 +19,18 @@ from legged_mw.robot.feet import Foot
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
 
-# ours: the knee's angle about the axis to the left [rad]; a quadruped leans its thighs back (Go1 0.9 and -1.8), a biped forwards
+# Ours: knee angle [rad] about the axis to the left, by number of feet. A quadruped leans its thighs back (Go1 0.9 and
+# -1.8), a biped forwards.
 KNEE = {2: 0.6}
 KNEE_ELSE = -1.6
-WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # as configs/g1_flat.py has them
-_SIDEWAYS = 0.9  # |y| of a joint's axis
-_BEHIND = 0.03  # [m] a foot so far behind the knee belongs to a leg that bends the other way (ANYmal's hind legs)
-_MARGIN = 0.05  # [rad] from the end of a range
+WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # from configs/g1_flat.py
+_SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
+_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
+_MARGIN = 0.05  # [rad] distance to the limits of a joint
 
 
 def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
-    """``pose`` (D,) with all legs bent; None if a leg has no two joints that bend it."""
+    """``pose`` (D,) with all legs bent; None if a leg has fewer than two sideways joints."""
     model, found = robot.physics, pose.copy()
     data = posed(model, pose)
     for foot in feet:
@@ -48,7 +50,7 @@ def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> 
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
-    """(D,) How near the default pose a biped's joints are to stay: hip and knee free to walk, ankles nearly, all others not."""
+    """Weights (D,) of a biped's pose reward: smallest for hip and knee, small for the ankle, large for all others."""
     model, data = robot.physics, posed(robot.physics, pose)
     weights = [HELD] * len(robot.joint_names)
     for foot in feet:
@@ -62,13 +64,13 @@ def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot])
 
 
 def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:
-    """1.0 if a straight leg's foot is ahead of its knee or below it, and goes ahead of it; -1.0 if it is behind."""
+    """The direction of the knee: 1.0 if the foot of the straight leg is below or ahead of the knee, -1.0 if behind."""
     ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
     return -1.0 if ahead < -_BEHIND else 1.0
 
 
 def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
-    """Joints from the root to the foot, without the root's."""
+    """The joints from the root to the foot, without the root joint."""
     body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
     while body:
         first = int(model.body_jntadr[body])
@@ -78,7 +80,7 @@ def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
 
 
 def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
-    """The nearest angle in the joint's range."""
+    """The nearest angle within the joint's limits."""
     if not model.jnt_limited[joint]:
         return float(angle)
     low, high = model.jnt_range[joint]
@@ -87,7 +89,7 @@ def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
 
 
 def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot) -> float:
-    """The hip's angle at which the foot is under it, of 200 within a right angle."""
+    """The hip angle [rad] at which the foot is under the hip: the best of 200 angles within 90 deg."""
     geoms = [model.geom(name).id for name in foot.geoms]
     off = {}
     for angle in np.linspace(-1.57, 1.57, 200):

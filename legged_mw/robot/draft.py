@@ -1,6 +1,6 @@
-"""A first task for a robot that has none: its feet guessed, its pose, gains and height computed. As values, and as a config file.
+"""A first task for a new robot: guess its feet, compute its pose, gains and height. As values, and as a config file.
 
-What is guessed or chosen is marked LOOK in the file.
+The file marks guessed and chosen values with LOOK.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import import_task
 
-LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
-# times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]
+LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
+# factors on the suggested gains; published gains are at most twice the suggested ones [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
-CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins inside of it
+CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
 class Draft(NamedTuple):
@@ -43,17 +43,17 @@ class Draft(NamedTuple):
 
     robot: RobotModel
     pose: list[float]  # (D,) [rad]
-    place: list[float]  # (3,) [m] of the root
+    place: list[float]  # (3,) [m] position of the root
     joints: tuple[Joint, ...]
     gains: list[Gains]
     feet: list[Foot]
-    guessed: list[str]  # what nobody said, a line each
-    pose_from: str  # where the default pose is from, in words
-    notes: list[str]  # what was dropped, added, changed or fused of the file, a line each
+    guessed: list[str]  # guessed values, one line each
+    pose_from: str  # source of the default pose, as text
+    notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
 
 
 def draft(file: Path) -> Draft:
-    """Guess what a task needs to know of the robot in ``file`` (MJCF or URDF)."""
+    """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF)."""
     read = read_robot(file)
     from_file = read.keyframe is not None
     env = _bare(file, from_file)
@@ -85,7 +85,7 @@ def draft(file: Path) -> Draft:
         if firmness == 1.0
         else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
     ]
-    # a bare robot's one site is its IMU
+    # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more])
 
@@ -93,7 +93,10 @@ def draft(file: Path) -> Draft:
 def _firm(
     robot: RobotModel, pose: list[float], place: list[float], joints: Sequence[Joint], feet: Sequence[Foot]
 ) -> tuple[float, list[Gains]]:
-    """The first of FIRMNESS with whose gains the robot stands on its feet, and these; 1 if none does, and on two feet, which tip anyway."""
+    """The smallest of FIRMNESS at which the robot stands on its feet, and its gains.
+
+    1 if the robot stands at none of them, or has two feet: a biped falls over at any gains.
+    """
     model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
     for geom in range(robot.ground_geoms().stop, model.ngeom):
         model.geom_conaffinity[geom] *= model.geom(geom).name in touching
@@ -110,7 +113,7 @@ def _firm(
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
-    """A world with the robot and nothing else, in the pose of the file's ``keyframe`` or with all joints at 0."""
+    """One world with only the robot, in the pose of the file's ``keyframe`` or with all joints at 0."""
     cfg = RobotTaskCfg()
     fields = {
         **{"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}},
@@ -122,7 +125,7 @@ def _bare(file: Path, keyframe: bool) -> RobotTask:
 
 
 def as_env(found: Draft, file: Path) -> LeggedRobot:
-    """One world of the task that the draft would be."""
+    """One world of the draft's task."""
     cfg = parents(found)[0]()
     cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
     cfg.asset.file = str(file.resolve())
@@ -130,7 +133,7 @@ def as_env(found: Draft, file: Path) -> LeggedRobot:
 
 
 def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]]:
-    """What the task subclasses."""
+    """The base classes of the task's configs."""
     if len(found.feet) == 2:
         presets = import_task(ROOT / "configs/base.py")
         return presets.BipedCfg, presets.BipedCfgPPO
@@ -138,7 +141,7 @@ def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]
 
 
 def has_mirror(env: LeggedRobot) -> bool:
-    """Whether the robot and its pose are the same left and right, so that learning may use it."""
+    """Whether the robot and its pose are symmetric left to right, so that learning may use the symmetry."""
     try:
         return env.mirror is not None
     except (ModelError, ConfigError):
@@ -146,7 +149,7 @@ def has_mirror(env: LeggedRobot) -> bool:
 
 
 def values(found: Draft) -> dict[str, dict[str, Any]]:
-    """Section -> field -> value."""
+    """The config values: section -> field -> value."""
     names, height = found.robot.joint_names, found.place[2]
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
@@ -174,7 +177,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """What else a task for two feet states: where BipedCfg's numbers are a G1's, and what a beginner on a few cores does without."""
+    """Further values for a biped: they replace BipedCfg's numbers of a G1, and simplify training on a few cores."""
     robot, mass = found.robot, float(found.robot.physics.body_subtreemass[0])
     data = posed(robot.physics, found.pose)
     left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
@@ -193,7 +196,7 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
-    """``numbers`` (D,) as a short table: the most frequent one for all others, a key for a family of joints, or exact names."""
+    """``numbers`` (D,) as a short table: the most frequent for all, other values by family or name of a joint."""
     common = Counter(numbers).most_common(1)[0][0]
     short, exact = {"": common}, dict(zip(names, numbers, strict=True))
     for name, number in exact.items():

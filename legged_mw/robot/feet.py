@@ -1,4 +1,4 @@
-"""Guess a robot's feet: the lowest parts that carry no others, and those of their name on other legs."""
+"""Guess a robot's feet: the lowest bodies without children, and bodies of the same family on other legs."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -15,21 +15,24 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.sim.surface_points import surfaces
 from legged_mw.utils.errors import ModelError
 
-# [m], and of the robot's height: ends of limbs that are so much higher than the lowest are feet too
+# [m], and share of the robot's height: ends of limbs up to this much higher than the lowest one are feet too
 _SAME, _SAME_SHARE = 0.03, 0.08
-_SOLE = 0.015  # [m] parts of a foot that are so much higher than its lowest are of its sole
+_SOLE = 0.015  # [m] geoms up to this much higher than the lowest geom of a foot belong to its sole
 
 
 class Foot(NamedTuple):
-    """A foot by a name that a task may use."""
+    """A foot with a name for the task's config."""
 
-    name: str  # of its only geom, or of a body with just these geoms, or of the body that has them among others
+    name: str  # of its only geom, of a body with exactly these geoms, or of a body with more geoms
     geoms: tuple[str, ...]
-    known: bool  # whether the name alone means these geoms
+    known: bool  # whether the name selects exactly these geoms
 
 
 def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
-    """Feet in the order of the file, with the robot at ``qpos`` (7 + D,). Raises ModelError if nothing touches."""
+    """The feet in the order of the file, for the robot at ``qpos`` (7 + D,).
+
+    Raises ModelError if no end of a limb collides.
+    """
     model, parents = robot.physics, {*robot.physics.body_parentid[1:]}
     colliding = [g for g in range(robot.ground_geoms().stop, model.ngeom) if model.geom_conaffinity[g]]
     names = [model.geom(g).name for g in colliding if model.geom_bodyid[g] not in parents]
@@ -44,7 +47,7 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     lowest = min(min(these.values()) for these in of_body.values())
     near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
     soles = {body: _sole(model, these) for body, these in of_body.items() if min(these.values()) <= near}
-    for body, these in of_body.items():  # a leg that the pose lifts has the same foot
+    for body, these in of_body.items():  # a lifted leg has the same kind of foot
         same = [
             other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))
         ]
@@ -54,15 +57,18 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
 
 
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
-    """Of a body's geoms, ``low`` [m, world] each, the lowest one and those of its kind that are about as low."""
+    """The sole of a body: its lowest geom, and geoms of that type at about that height.
+
+    ``low``: geom -> z of its lowest point [m, world frame].
+    """
     lowest = min(low, key=lambda geom: low[geom])
     return [g for g, z in low.items() if z <= low[lowest] + _SOLE and model.geom_type[g] == model.geom_type[lowest]]
 
 
 def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
-    """A name for these geoms of ``body``."""
+    """The foot with these geoms of ``body``, named by its geom or body."""
     names = tuple(robot.physics.geom(geom).name for geom in geoms)
-    # also such as are fused in what is stepped
+    # also bodies that are fused in the simulated model
     parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]
     if parts:
         return Foot(parts[-1], names, True)

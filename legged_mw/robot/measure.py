@@ -1,11 +1,13 @@
-"""A robot in numbers, by plain MuJoCo on a CPU: how it stands, and what its servos ask of the simulation step.
+"""The numbers of a robot's health page, computed by MuJoCo on a CPU: standing, and the stability of its servos.
 
-Shapes: D joints, V degrees of freedom (6 of the root first), P points. Nothing here knows a config, a task or an observation.
+Shapes: D joints, V degrees of freedom (the first 6 are the root's), P points. Independent of configs and tasks.
 
-The servo of one joint with inertia I, stepped with dt, is v' = v - d v - s x / dt, x' = x + dt v' with d = dt kd / I and
-s = dt^2 kp / I. Its characteristic polynomial is z^2 - (2 - s - d) z + (1 - d), so it is stable for 0 < d < 2 and 2 d + s < 4
-(Jury's conditions): without damping dt sqrt(kp / I) < 2, without stiffness dt kd / I < 2. From d = 1 on the damping alone turns the
-velocity's sign in every substep: it rings. The integrator implicitfast takes v' for v in the damping: any d is stable, and s < 4 + 2 d.
+The servo of one joint with inertia I and time step dt is
+v' = v - d v - s x / dt, x' = x + dt v', with d = dt kd / I and s = dt^2 kp / I.
+Its characteristic polynomial is z^2 - (2 - s - d) z + (1 - d). By Jury's conditions it is stable for 0 < d < 2 and
+2 d + s < 4: without damping dt sqrt(kp / I) < 2, without stiffness dt kd / I < 2. For d >= 1 the damping alone changes
+the sign of the velocity in every substep: the joint rings. The integrator implicitfast uses v' in place of v in the
+damping: any d is stable, and s < 4 + 2 d.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -30,40 +32,40 @@ from legged_mw.sim.robot_file import tilt
 
 FloatArray = NDArray[np.float64]
 
-STAND_SECONDS = 5.0  # [s] how long the servos are watched
-STAND_TILT = 60.0  # [deg] of the root: beyond it, it fell
-STAND_HEIGHT = 0.5  # of the height it began with: below it, it sank
-TOPPLED = 15.0  # [deg] a statue that tilts so far does not rest on its feet
-_STIFF = 1e5  # [kg m^2] armature of a joint that gravity shall not move: 100 N m turn it by 1 mrad/s in a second
-_FAST = 1.0e4  # [m/s, rad/s] beyond it a state counts as not finite (termination.max_speed)
+STAND_SECONDS = 5.0  # [s] duration of the standing test
+STAND_TILT = 60.0  # [deg] of the root; a larger tilt is a fall
+STAND_HEIGHT = 0.5  # share of the initial height; below it, the robot sank
+TOPPLED = 15.0  # [deg] beyond this tilt the rigid robot does not rest on its feet
+_STIFF = 1e5  # [kg m^2] armature that locks a joint: 100 N m accelerate it by 1 mrad/s^2
+_FAST = 1.0e4  # [m/s, rad/s] a faster state counts as diverged (termination.max_speed)
 
 
 class Rest(NamedTuple):
-    """The robot as a statue in one pose, at rest on level ground."""
+    """The robot with locked joints, at rest on level ground."""
 
     qpos: FloatArray  # (7 + D,)
-    torque: FloatArray  # (D,) [N m] that the joints need to keep the pose
-    points: FloatArray  # (P, 3) [m] of contact with the ground
+    torque: FloatArray  # (D,) [N m] joint torques that hold the pose
+    points: FloatArray  # (P, 3) [m] contact points on the ground
     com: FloatArray  # (3,) centre of mass [m]
     contacts: int
-    rows: int  # constraint rows of the model that is stepped: contacts, dry friction, limits that are met
-    toppled: bool  # it tilts over; torques and points are those of a root that is held upright
+    rows: int  # constraint rows of the simulated model: contacts, dry friction, active limits
+    toppled: bool  # the robot falls over; torques and points are then those of a root that is held upright
 
 
 class Joint(NamedTuple):
-    """What a joint's servo works with, and what a step makes of it."""
+    """The properties of a joint and its servo, and the servo's stability."""
 
     name: str
     low: float  # [rad]
     high: float  # [rad]; both infinite without limits
     effort: float  # [N m]
-    speed: float  # [rad/s]; infinite: nobody said
+    speed: float  # [rad/s]; infinite if unknown
     armature: float  # [kg m^2]
     kp: float  # [N m/rad]
     kd: float  # [N m s/rad]
-    inertia: float  # [kg m^2] smallest over the poses: what its motor turns while all else is free
-    pose: str  # the pose of that
-    held: float  # [kg m^2] in the default pose while all else is held: the diagonal of the mass matrix
+    inertia: float  # [kg m^2] smallest inertia over the poses, with all other joints free
+    pose: str  # the pose with this inertia
+    held: float  # [kg m^2] inertia in the default pose with all else locked: diagonal of the mass matrix
     torque: float  # [N m] at rest
 
     def damping_step(self, dt: float) -> float:
@@ -79,11 +81,11 @@ class Joint(NamedTuple):
         return self.kd / (2.0 * math.sqrt(self.kp * self.inertia)) if self.kp else math.inf
 
     def sag(self) -> float:
-        """[rad] off its target at rest; infinite without stiffness."""
+        """Position error at rest [rad]; infinite without stiffness."""
         return abs(self.torque) / self.kp if self.kp else math.inf
 
     def verdict(self, dt: float, implicit: bool) -> str:
-        """What is wrong with the step for this joint, in a word: "", "rings" or "unstable" (see the top of this file)."""
+        """The servo's stability at this time step: "" (stable), "rings" or "unstable"; see the top of this file."""
         d, s = self.damping_step(dt), self.stiffness_step(dt) ** 2
         if s >= 4.0 + 2.0 * d if implicit else (d >= 2.0 or 2.0 * d + s >= 4.0):
             return "unstable"
@@ -91,43 +93,43 @@ class Joint(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """The mode of all servos together, in the air, that a substep makes grow the most."""
+    """The fastest growing mode of all servos together, without ground contact."""
 
-    growth: float  # factor a substep; 1: the free root, which nothing damps
-    joints: tuple[str, ...]  # that move most in it
+    growth: float  # factor per substep; 1 is the undamped free root
+    joints: tuple[str, ...]  # joints with the largest amplitude
 
 
 class Stand(NamedTuple):
-    """What becomes of the robot on its servos with action zero."""
+    """The result of the standing test: servos on, action zero."""
 
-    seconds: float  # until it fell, sank or broke; STAND_SECONDS if it did not
+    seconds: float  # time until it fell, sank or diverged; else STAND_SECONDS
     end: str  # "stands", "falls", "sinks" or "diverges"
-    joints: tuple[str, ...] = ()  # the fastest ones, where it diverges
+    joints: tuple[str, ...] = ()  # the fastest joints, if it diverges
 
 
 @dataclass(frozen=True)
 class RobotNumbers:
-    """All numbers of the page."""
+    """All numbers of the health page."""
 
     mass: float  # [kg]
-    height: float  # of the root above the ground, at rest [m]
-    top: float  # of the highest point of the robot [m]
-    margin: float  # centre of mass to the edge of what its contacts span, on the ground [m]; negative: outside
+    height: float  # [m] of the root above the ground, at rest
+    top: float  # [m] of the robot's highest point
+    margin: float  # [m] from the centre of mass to the edge of the support polygon; negative: outside
     rest: Rest
     joints: tuple[Joint, ...]
     mode: Mode
     stand: Stand
-    dt: float  # substep [s]
+    dt: float  # [s] substep
     implicit: bool  # whether the integrator is implicitfast
-    room: Capacity  # for contacts and constraint rows on mujoco-warp
+    room: Capacity  # for contacts and constraint rows in mujoco-warp
 
 
 def measure(
     robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5, rough: bool = False
 ) -> RobotNumbers:
-    """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
+    """The numbers of ``robot``, upright on level ground in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m].
 
-    Room is counted for ``rough`` ground, if so.
+    ``rough``: compute the buffer capacity for rough terrain.
     """
     model, angles = robot.physics, np.array(pose, dtype=float)
     rest = stand_as_statue(robot, angles, np.array(place, dtype=float))
@@ -152,14 +154,14 @@ def measure(
 
 
 def stand_as_statue(robot: RobotModel, pose: FloatArray, place: FloatArray) -> Rest:
-    """Let the robot down onto level ground with its joints held in ``pose`` (D,), until it rests."""
+    """Lower the robot onto level ground with its joints locked in ``pose`` (D,), until it rests."""
     free = _settle(robot, pose, place, upright=False)
     if toppled := tilt(free.qpos[3:7]) > TOPPLED:
         free = _settle(robot, pose, place, upright=True)
     model, data = robot.physics, mujoco.MjData(robot.physics)
     data.qpos[:] = free.qpos
     mujoco.mj_forward(model, data)
-    torque = free.qfrc_bias - free.qfrc_constraint - free.qfrc_spring  # what the servos must give so that nothing moves
+    torque = free.qfrc_bias - free.qfrc_constraint - free.qfrc_spring  # the torques that the servos need for no motion
     ground = robot.ground_geoms()
     touching = [c.pos for c in free.contact if any(ground.start <= geom < ground.stop for geom in c.geom)]
     points = np.array(touching).reshape(-1, 3)
@@ -171,12 +173,12 @@ def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: boo
     model.opt.timestep, model.opt.iterations, model.opt.ls_iterations = 0.002, 50, 50
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    model.dof_frictionloss[:], model.jnt_limited[:] = 0.0, 0  # what carries load in the place of a servo
+    model.dof_frictionloss[:], model.jnt_limited[:] = 0.0, 0  # switch off all other sources of joint torque
     model.dof_armature[6:] = _STIFF
     if upright:
         model.dof_armature[3:6] = _STIFF
     mass, size = float(model.body_subtreemass[0]), max(float(place[2]), 0.1)
-    model.dof_damping[:6] = [10.0 * mass] * 3 + [3.0 * mass * size**2] * 3  # it comes to rest within a second
+    model.dof_damping[:6] = [10.0 * mass] * 3 + [3.0 * mass * size**2] * 3  # strong enough for rest within a second
     data = mujoco.MjData(model)
     data.qpos[:] = [*place, 1.0, 0.0, 0.0, 0.0, *pose]
     for _ in range(20):
@@ -188,10 +190,10 @@ def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: boo
 
 
 def inside_by(points: FloatArray, place: FloatArray) -> float:
-    """How far ``place`` (2,) lies inside the convex hull of ``points`` (P, 2) [m]; negative: outside by so much.
+    """The distance [m] of ``place`` (2,) to the edge of the convex hull of ``points`` (P, 2) [m]; negative if outside.
 
-    It is how far the hull reaches beyond the place in the direction in which it reaches least: square to a line through two
-    of the points, or from a point to the place.
+    It is the smallest support distance of the hull from ``place`` over all directions. The minimum is normal to a line
+    through two of the points, or along the line from a point to ``place``.
     """
     if not len(points):
         return -math.inf
@@ -203,7 +205,7 @@ def inside_by(points: FloatArray, place: FloatArray) -> float:
 
 
 def _highest(robot: RobotModel, qpos: FloatArray) -> float:
-    """[m] of the robot's geoms, looks included."""
+    """The highest point of the robot's geoms [m], visuals included."""
     model = robot.spec.copy().compile()
     data = posed(model, qpos[7:], qpos[:7])
     geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid])
@@ -216,7 +218,11 @@ def _highest(robot: RobotModel, qpos: FloatArray) -> float:
 
 
 def mass_matrices(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
-    """(V, V) with the root upright, armature included, by pose: ``pose`` (D,) is "default"; all joints "low", "middle", "high"."""
+    """Mass matrices (V, V) with armature, root upright, for four poses.
+
+    "default" is ``pose`` (D,). "low", "middle" and "high" have all joints at that point of their ranges; the range of a
+    joint without limits is ``pose`` +- 1 rad.
+    """
     limited = robot.physics.jnt_limited[1:] > 0
     low, high = robot.joint_range.T
     low, high = np.where(limited, low, pose - 1.0), np.where(limited, high, pose + 1.0)
@@ -232,7 +238,7 @@ def _mass_matrix(model: mujoco.MjModel, pose: FloatArray) -> FloatArray:
 
 
 def what_joints_bear(robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArray) -> tuple[Joint, ...]:
-    """Each joint with the smallest inertia of ``mass_matrices``, and its ``torque`` (D,) at rest [N m]."""
+    """The properties of each joint, from ``mass_matrices`` and its ``torque`` (D,) at rest [N m]."""
     model, rows = robot.physics, []
     free = {name: 1.0 / np.diag(np.linalg.inv(matrix)) for name, matrix in matrices.items()}
     for i, name in enumerate(robot.joint_names):
@@ -257,7 +263,7 @@ def what_joints_bear(robot: RobotModel, matrices: dict[str, FloatArray], torque:
 
 
 def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:
-    """What a substep does to all joints together, in the air, from the mass ``matrix`` (V, V)."""
+    """The fastest growing mode of all joints per substep, without contact, from the mass ``matrix`` (V, V)."""
     model, size = robot.physics, len(matrix)
     dt = float(model.opt.timestep)
     stiffness = np.diag([0.0] * 6 + [*(np.array(robot.tables["stiffness"]) + model.jnt_stiffness[1:])])
@@ -275,7 +281,7 @@ def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:
 
 
 def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float], decimation: int) -> Stand:
-    """Step the robot from ``pose`` with its servos' targets there, as a task with action zero would."""
+    """Simulate the robot from ``pose`` (D,) with servo targets at ``pose``, as a task does at action zero."""
     sim = make_simulation(robot.physics, 1, "cpu", engine="mujoco", nconmax=0, njmax=0)
     qpos, qvel = sim.qpos.numpy()[0], sim.qvel.numpy()[0]
     qpos[:], sim.ctrl.numpy()[0] = [*place, 1.0, 0.0, 0.0, 0.0, *pose], pose

@@ -1,4 +1,4 @@
-"""Meshes and pictures that are not there, or that MuJoCo cannot read: looks are left out, what the physics needs is an error."""
+"""Missing or unreadable meshes and textures: drop those of visuals, raise an error for those of the physics."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -13,25 +13,25 @@ import numpy as np
 from legged_mw.sim.robot_file import compile_copy
 from legged_mw.utils.errors import ModelError
 
-READABLE = (".stl", ".obj", ".msh")  # that MuJoCo has a reader for
+READABLE = (".stl", ".obj", ".msh")  # mesh formats of MuJoCo's reader
 INSTEAD = 'give the geom a primitive shape, or let it not collide (contype="0" conaffinity="0")'
 
 
 def why_unreadable(path: Path) -> str:
-    """Why MuJoCo would not read a mesh file, as far as its name tells; "" if it may."""
+    """The reason why MuJoCo cannot read a mesh file, judged by its name and existence; "" if there is none."""
     if path.suffix.lower() not in READABLE:
         return f"MuJoCo reads no {path.suffix or 'file without an ending'}, only {', '.join(READABLE)}"
     return "" if path.is_file() else "no such file"
 
 
 def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoco.MjModel:
-    """Compile ``spec`` without the looks whose files cannot be read; they are removed from it.
+    """Compile ``spec`` after removing visuals with unreadable files.
 
-    Raises ModelError for a mesh that collides or gives a body its mass, ValueError for what else is wrong.
+    Raises ModelError for an unreadable mesh that collides or gives a body its mass, ValueError for any other fault.
     """
     try:
         return compile_copy(spec)
-    except ValueError:  # only then files are looked at: those of an attached model are not where the others are
+    except ValueError:  # check files only now, because an attached model has other paths
         broken = {
             mesh.name: why_unreadable(path_of(spec, mesh)) or _read_error(spec, mesh)
             for mesh in spec.meshes
@@ -45,7 +45,7 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
 
 
 def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: list[str]) -> None:
-    """Remove meshes, name -> why, and the geoms that show them; one whose reason is empty stays."""
+    """Remove meshes and the geoms that show them. ``reasons``: name of the mesh -> reason; empty: keep it."""
     left_out: dict[str, list[str]] = {}
     for mesh in [mesh for mesh in spec.meshes if reasons.get(mesh.name)]:
         for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
@@ -58,13 +58,13 @@ def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: li
 
 
 def path_of(spec: mujoco.MjSpec, item: mujoco.MjsMesh | mujoco.MjsTexture | mujoco.MjsSkin, file: str = "") -> Path:
-    """The file of a mesh, skin or picture, or another ``file`` in its place."""
+    """The path of a mesh, skin or texture, or of ``file`` in the same folder."""
     folder, name = spec.texturedir if isinstance(item, mujoco.MjsTexture) else spec.meshdir, Path(file or item.file)
     return Path(spec.modelfiledir) / folder / (name.name if spec.strippath else name)
 
 
 def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
-    """What MuJoCo says of the mesh alone; "" if nothing is wrong with it."""
+    """MuJoCo's error for the mesh alone; "" if it compiles."""
     alone = mujoco.MjSpec()
     alone.add_mesh(name="mesh", file=str(path_of(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
     alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0, density=0.0)
@@ -92,7 +92,7 @@ def _refuse_what_matters(
 
 
 def _missing_pictures(spec: mujoco.MjSpec) -> dict[str, list[str]]:
-    """Texture -> those of its files that are not there."""
+    """Texture -> its missing files."""
     files = {
         t.name: [file for file in (t.file, *t.cubefiles) if file and not path_of(spec, t, file).is_file()]
         for t in spec.textures
@@ -105,7 +105,7 @@ def _missing_skins(spec: mujoco.MjSpec) -> list[mujoco.MjsSkin]:
 
 
 def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Skins and textures from files that are missing: the materials keep their colours."""
+    """Remove skins and textures with missing files. The materials keep their colours."""
     missing = _missing_pictures(spec)
     gone = [file for files in missing.values() for file in files] + [skin.file for skin in _missing_skins(spec)]
     for skin in _missing_skins(spec):

@@ -1,8 +1,8 @@
-"""Read the XML of strangers' robots and scenes: parse it once, check its attributes, and give MuJoCo the checked tree.
+"""Read untrusted XML of robots and scenes: parse it once, check its attributes, pass the checked tree to MuJoCo.
 
-MuJoCo does not read the file, nor files that it includes or attaches, but the text of the parsed trees. So an entity, a
-comment, an encoding or malformed XML cannot mean one thing here and another in MuJoCo. A refusal is a ValueError in one
-line, without the file's name.
+MuJoCo gets the text of the parsed trees, not the file or its included and attached files. So an entity, a comment, an
+encoding or malformed XML cannot have one meaning here and another in MuJoCo. An error is a ValueError of one line
+without the file's name.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -26,16 +26,17 @@ import numpy as np
 
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
 _INSIDE = "model.xml"
-MOST_BYTES = 64 << 20  # of one file: ten times the largest known robots with their meshes inside
-# [kg] of a body; any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
+MOST_BYTES = 64 << 20  # of one file: ten times the largest known robots with inline meshes
+# Largest mass of a body [kg]; length [m] or inertia [kg m^2]; gravity [m/s^2], which is 981 for a file in cm.
 HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3
-_ELEMENTS, _CELLS, _DEEPEST = 20_000, 1e8, 200  # with all copies; of height fields and pictures; nested
+# Most elements, with all copies; cells of height fields and textures; depth of nesting.
+_ELEMENTS, _CELLS, _DEEPEST = 20_000, 1e8, 200
 _TOO_MUCH = (
     f"makes more than {_ELEMENTS} elements, all copies counted, or {_CELLS:g} cells of height fields and pictures"
 )
-_PLACES = 100_000  # files that it names, times folders where they may lie
-_PIECE, _LONGEST = 1 << 20, 16 << 20  # [byte] for the parser at a time; of one element with its attributes
-# attribute -> the largest sensible value
+_PLACES = 100_000  # most named files times folders to search
+_PIECE, _LONGEST = 1 << 20, 16 << 20  # [byte] fed to the parser at a time; largest element with attributes
+# attribute -> largest accepted value
 _MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}
 _MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {
     "nuserdata": 1e6
@@ -44,24 +45,24 @@ _MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": 
 # arrays of the compiled model
 _SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")
 _DIRS = ("meshdir", "texturedir", "assetdir")
-_OF_URDF = ("mesh", "texture", "compiler")  # elements of a URDF with files that MuJoCo reads
+_OF_URDF = ("mesh", "texture", "compiler")  # elements of a URDF that name files for MuJoCo
 _NAMES = ("name", "class", "childclass", "model", "file", "dir", *_DIRS)
 
 
 class XmlSource:
-    """A robot's file with the files that it includes and attaches. Raises ValueError for things that no robot needs.
+    """A robot's file with its included and attached files. Raises ValueError for content that no robot needs.
 
-    ``alone``: no file outside of its own folder is allowed. Otherwise meshes and textures may lie elsewhere.
+    ``alone``: refuse files outside the file's folder. Otherwise meshes and textures may lie elsewhere.
     """
 
     def __init__(self, file: Path, alone: bool = False) -> None:
         self.file, self.alone = file.absolute(), alone
         self.home = os.path.realpath(self.file.parent)
-        self.named: dict[str, str] = {}  # file -> the line that names it
-        self.folders: dict[str, None] = {}  # where these files may lie, in order
+        self.named: dict[str, str] = {}  # named file -> line in which it is named
+        self.folders: dict[str, None] = {}  # folders to search for these files, in order
         self._parts = {os.path.realpath(file): ""}  # included or attached file -> its name for MuJoCo; "": being read
-        self._texts: dict[str, bytes] = {}  # that name without the folder -> the text for MuJoCo
-        self.elements, self._largest = 0, 0.0  # elements so far; elements of the largest file, with its copies
+        self._texts: dict[str, bytes] = {}  # name for MuJoCo, without folder -> text for MuJoCo
+        self.elements, self._largest = 0, 0.0  # number of elements read; elements of the largest file, with its copies
         self.root = self._read(self.file, str(self.file.parent))
         if len(self.named) * len(self.folders) > _PLACES:
             raise ValueError(
@@ -76,18 +77,18 @@ class XmlSource:
 
     @property
     def text(self) -> str:
-        """The text for MuJoCo: the elements of the file, each in its old line."""
+        """The text for MuJoCo. Each element keeps its line number in the file."""
         return tostring(self.root, encoding="unicode")
 
     def spec(self) -> mujoco.MjSpec:
         """MuJoCo's spec of ``root``."""
-        if self.file.suffix == ARCHIVE:  # it names no other file
+        if self.file.suffix == ARCHIVE:  # an archive names no other file
             return mujoco.MjSpec.from_string(self.text)
-        name = f"{self.file}.xml"  # MuJoCo warns about endings that it does not know
+        name = f"{self.file}.xml"  # MuJoCo warns about unknown suffixes
         return mujoco.MjSpec.from_file(name, include={os.path.basename(name): self.text.encode(), **self._texts})
 
     def take(self, name: str, path: str, folder: str) -> str:
-        """Read an included or attached file. Return its path for MuJoCo: in the same folder, under a unique name."""
+        """Read an included or attached file. Return its path for MuJoCo: the same folder, a unique name."""
         real = os.path.realpath(path)
         if not Path(real).is_relative_to(self.home):
             raise ValueError(f"it includes {name[:200]}, which lies outside of its own folder; put that file beside it")
@@ -110,7 +111,7 @@ class XmlSource:
         return root
 
     def _size(self, element: Element) -> float:
-        """How many elements MuJoCo makes of it; cells of height fields and pictures count as parts of elements."""
+        """The number of elements that MuJoCo creates for this one. A cell of a height field or texture is a share."""
         size = 1.0 + (self._largest if element.tag in ("include", "attach") else 0.0)
         for sides in (("nrow", "ncol"), ("width", "height")):
             size += math.prod(max(_numbers(element.get(side, "")), default=0.0) for side in sides) * _ELEMENTS / _CELLS
@@ -120,7 +121,7 @@ class XmlSource:
 
 
 class _Reader:
-    """Builds the tree of one file, without comments and text. Raises ValueError with the line."""
+    """Builds the tree of one file, without comments and text. Raises ValueError with the line number."""
 
     def __init__(self, source: XmlSource, path: Path, folder: str) -> None:
         self.source, self.path, self.folder = source, path, folder  # folder: of the model to which the file belongs
@@ -134,7 +135,7 @@ class _Reader:
         try:
             for start in range(0, len(content), _PIECE):
                 self.parser.Parse(content[start : start + _PIECE])
-                # the parser scans an unfinished element again with each piece
+                # limit this length, because the parser scans an unfinished element again with each piece
                 if start - self.parser.CurrentByteIndex > _LONGEST:
                     raise ValueError(f"{self.where}an element has more than {_LONGEST >> 20} MiB")
             self.parser.Parse(b"", True)
@@ -156,7 +157,7 @@ class _Reader:
         if self.source.elements > _ELEMENTS:
             raise ValueError(f"{self.where}it {_TOO_MUCH}")
         self.urdf = self.urdf or (tag == "robot" and self.depth == 1)
-        unread = self.urdf and tag not in _OF_URDF  # such as a simulator's plugins
+        unread = self.urdf and tag not in _OF_URDF  # ignored, such as a simulator's plugins
         for name, value in attributes.items():
             if wrong := "" if name in _NAMES else _wrong(name, value):
                 raise ValueError(f'{self.where}{name}="{value[:60]}" {wrong}')
@@ -164,7 +165,7 @@ class _Reader:
                 self._note(name, value)
         if tag in ("include", "model") and (name := attributes.get("file")):
             here, home = (os.path.join(folder, name) for folder in (self.path.parent, self.folder))
-            path = here if tag == "model" or not os.path.lexists(home) else home  # as in MuJoCo
+            path = here if tag == "model" or not os.path.lexists(home) else home  # same rule as MuJoCo
             attributes["file"] = self.source.take(name, path, os.path.dirname(path) if tag == "model" else self.folder)
         self.builder.data("\n" * (self.parser.CurrentLineNumber - self.line))
         self.line = self.parser.CurrentLineNumber
@@ -175,7 +176,7 @@ class _Reader:
         self.builder.end(tag)
 
     def _note(self, attribute: str, name: str) -> None:
-        """Note a file or folder that an attribute names."""
+        """Record a file or folder that an attribute names."""
         if self.source.file.suffix == ARCHIVE:
             raise ValueError(f"{self.where}it names {name[:200]}; the model of an archive stands alone")
         if self.source.alone and not Path(os.path.realpath(os.path.join(self.source.home, name))).is_relative_to(
@@ -197,7 +198,7 @@ def write_archive(file: Path, text: str) -> None:
 
 
 def _text(file: Path) -> str:
-    """The text of an MJCF, a URDF or an MJZ. Raises ValueError for too large a file and an MJZ with more in it."""
+    """The text of an MJCF, URDF or MJZ. Raises ValueError for a large file, or an MJZ with other contents."""
     _check_size(file.name, file.stat().st_size)
     if file.suffix != ARCHIVE:
         return _without_comments(file.read_text(encoding="utf-8", errors="replace"))
@@ -222,7 +223,7 @@ def _check_size(name: str, size: int) -> None:
 
 
 def _without_comments(text: str) -> str:
-    """``text`` without comments and <?xml ?>, in as many lines: MuJoCo accepts more of both than a parser does."""
+    """``text`` without comments and <?xml ?>, with equal line numbers. MuJoCo accepts more forms of both than expat."""
     if text.count("<!--") + text.count("<?xml") > _ELEMENTS:
         raise ValueError(f"it has more than {_ELEMENTS} comments")
     found = r"<!--.*?(?:-->|\Z)|<\?xml\s[^<>]*>"
@@ -230,7 +231,7 @@ def _without_comments(text: str) -> str:
 
 
 def _check_regular(path: str, where: str) -> None:
-    """Raise ValueError if ``path`` exists and is no regular file, such as a device, which never ends."""
+    """Raise ValueError if ``path`` exists and is not a regular file, such as a device of infinite length."""
     try:
         regular = stat.S_ISREG(os.stat(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -242,15 +243,15 @@ def _check_regular(path: str, where: str) -> None:
 
 
 def _numbers(value: str) -> list[float]:
-    """The numbers in an attribute; none if it holds something else."""
+    """The numbers in an attribute; empty if it has anything else."""
     try:
-        return [float(part) for part in value.split(None, 9)]  # the checked attributes have fewer
+        return [float(part) for part in value.split(None, 9)]  # the checked attributes have fewer numbers
     except ValueError:
         return []
 
 
 def _wrong(name: str, value: str) -> str:
-    """The fault of the numbers in an attribute; "" if there is none."""
+    """The error in an attribute's numbers as text; "" if there is none."""
     if "nan" in value.lower() and any(part.lower().strip("+-") == "nan" for part in value.split()):
         return "is not a number"
     if name.endswith("range") and len(numbers := _numbers(value)) == 2 and numbers[0] > numbers[1]:
@@ -265,7 +266,7 @@ def _wrong(name: str, value: str) -> str:
 
 
 def check_model(model: Any) -> None:
-    """Raise ValueError for a compiled model that cannot be stepped: numbers that are not finite, or too large."""
+    """Raise ValueError for a compiled model with numbers that are not finite or too large."""
     gravity = model.opt.gravity
     if not np.linalg.norm(gravity) <= FASTEST:
         raise ValueError(f"gravity is {' '.join(f'{g:g}' for g in gravity)} m/s^2; it must be {FASTEST:g} at most")

@@ -1,4 +1,4 @@
-"""Write a first task: NAME.xml, the robot alone, and NAME_flat.py, a config that can be trained at once."""
+"""Write a first task: NAME.xml, the robot alone, and NAME_flat.py, a config that is ready for training."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -23,7 +23,7 @@ from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.robot_file import naming
 from legged_mw.utils.errors import UserError, shown
 
-WIDTH = 140  # [columns] of a line of the config
+WIDTH = 140  # [columns] longest line of the config
 
 _HEAD = '''"""{title} ({legs}, {joints} joints; {file}) follows a joystick on flat ground. Check what is marked LOOK."""
 
@@ -59,7 +59,7 @@ _COMMENTS = {
 
 
 def targets(name: str, folder: Path, force: bool = False) -> tuple[Path, Path]:
-    """The files that a task called ``name`` is written to. Raises UserError for a bad name, or if one of them is there."""
+    """The paths of the two files of the task ``name``. Raises UserError for an invalid name or an existing file."""
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise UserError(f"--new {name}: a name begins with a letter and has letters, digits and _ only")
     robot, config = folder / f"{name}.xml", folder / f"{name}_flat.py"
@@ -72,7 +72,7 @@ def targets(name: str, folder: Path, force: bool = False) -> tuple[Path, Path]:
 
 
 def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False, mirrors: bool = False) -> list[Path]:
-    """Write both files into ``folder``; ``mirrors`` says whether learning may mirror the robot. Raises UserError as ``targets`` does."""
+    """Write both files into ``folder``. ``mirrors``: the robot is symmetric, see ``has_mirror``. Raises UserError."""
     robot, config = targets(name, folder, force)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -90,7 +90,7 @@ def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False
 
 
 def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> str:
-    """The config file: LOOK marks what to check."""
+    """The text of the config file. LOOK marks values to check."""
     feet = len(found.feet)
     legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
     title = "".join(part.capitalize() for part in name.split("_"))
@@ -137,7 +137,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
 
 
 def _imports(found: Draft) -> str:
-    """What the file imports, sorted."""
+    """The import lines of the config file, sorted."""
     cfg, train = parents(found)
     lines = ["from legged_mw.envs.legged_robot import LeggedRobot", "from legged_mw.utils.task import Task"]
     if cfg.__module__ == train.__module__:
@@ -148,7 +148,7 @@ def _imports(found: Draft) -> str:
 
 
 def _force_limits(found: Draft) -> list[str]:
-    """What to write where the file has none."""
+    """A line for the config if the robot's file lacks force limits."""
     endless = [joint.name for joint in found.joints if joint.effort == float("inf")]
     if not endless:
         return []
@@ -163,15 +163,15 @@ def _force_limits(found: Draft) -> list[str]:
 
 
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
-    """``name = value  # comment``, in several lines where it is longer than a line may be."""
+    """``name = value  # comment``, split into several lines if it is longer than WIDTH."""
     space, note = " " * indent, f"  # {comment}" if comment else ""
-    # of the others as Python has them, in ruff's quotes
+    # json writes all values except booleans as Python does, with ruff's quotes
     text = str(value) if isinstance(value, bool) else json.dumps(value)
     line = f"{space}{name} = {text}"
     if len(line + note) <= WIDTH:
         return [line + note]
     opening, closing = ("{", "}") if isinstance(value, dict) else ("[", "]")
-    parts = json.dumps(value)[1:-1].replace(": ", ":\0") + ","  # a key and its number stay in one line
+    parts = json.dumps(value)[1:-1].replace(": ", ":\0") + ","  # keep a key and its number on one line
     lines = textwrap.wrap(parts, WIDTH - indent - 4, break_long_words=False, break_on_hyphens=False)
     return [
         f"{space}{name} = {opening}{note}",
@@ -184,13 +184,13 @@ def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
 
 
 def stands_alone(file: Path) -> bool:
-    """Whether ``file`` is an MJCF that needs no other file: then a copy of it is the robot."""
+    """Whether ``file`` is an MJCF that needs no other file, so that it can be copied."""
     source = XmlSource(file)
     return source.root.tag == "mujoco" and not source.named
 
 
 def as_mjcf(name: str, file: Path, folder: Path) -> str:
-    """The robot in ``file`` as text to be written into ``folder``; meshes are named relative to that."""
+    """The robot in ``file`` as MJCF text for ``folder``, with mesh paths relative to ``folder``."""
     robot = read_robot(file)
     spec = robot.spec
     for joint in robot.joints:
@@ -208,7 +208,7 @@ def as_mjcf(name: str, file: Path, folder: Path) -> str:
 
 
 def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
-    """Give meshes and pictures absolute paths, and return these; what is not there is left as it was written."""
+    """Give meshes and textures absolute paths, and return these. Missing files keep their paths."""
     found: set[Path] = set()
 
     def named(item: mujoco.MjsMesh | mujoco.MjsTexture, file: str) -> str:

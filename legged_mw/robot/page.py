@@ -1,4 +1,4 @@
-"""The health page as text: numbers of ``measure``, gains of ``suggest``, and what should be looked at, also of a task."""
+"""The health page as text: numbers from ``measure``, gains from ``suggest``, and a list of faults and doubts."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from legged_mw.robot.suggest import Gains, suggest
 from legged_mw.utils.errors import in_short, place_of
 from legged_mw.utils.task import LoadedTask
 
-_GROWS = 1e-6  # more than 1 by so much, a mode grows; less is rounding of the root's
-_TIP = 0.3  # [rad] a joint that sags more than this does not stand as its default pose says
+_GROWS = 1e-6  # a mode grows if its factor is above 1 by more than this; less is rounding in the root's modes
+_TIP = 0.3  # [rad] with a larger sag, a joint stands away from the default pose
 _HEAD = (
     "joint",
     "inertia",
@@ -36,7 +36,7 @@ _HEAD = (
 
 
 def page(health: RobotNumbers, title: str, guessed: Sequence[str] = (), changed: Sequence[str] = ()) -> str:
-    """Everything, as lines; ``guessed`` are lines on what nobody said and was taken, ``changed`` on what of the file is not as written."""
+    """The whole page. ``guessed``: lines about guessed values. ``changed``: lines about changes to the robot's file."""
     gains = suggest(health.joints, health.dt)
     lines = [f"health of {title}", *(f"  guessed: {line}" for line in guessed), *_summary(health)]
     lines += ["joints", *_table(health, gains), *_LEGEND]
@@ -78,7 +78,7 @@ def _summary(health: RobotNumbers) -> list[str]:
 
 
 def standing(stand: Stand) -> str:
-    """How long it stands on its servos, in words."""
+    """The result of the standing test as text."""
     if stand.end == "stands":
         return f"stands on its servos for {STAND_SECONDS:g} s"
     what = {"falls": f"tilts beyond {STAND_TILT:g} degrees", "sinks": "sinks below half of its height"}
@@ -127,7 +127,7 @@ def _those(which: Sequence[Joint]) -> str:
 
 
 def faults(health: RobotNumbers) -> list[str]:
-    """What should be looked at, a line each: what is wrong, where, and the field that mends it. Here what no training makes up for."""
+    """Faults that no training can compensate, one line each: the fault, its place, the config field that fixes it."""
     dt, joints, lines = health.dt, health.joints, []
     if bad := [joint for joint in joints if joint.verdict(dt, health.implicit) == "unstable"]:
         lines.append(
@@ -150,7 +150,7 @@ def faults(health: RobotNumbers) -> list[str]:
 
 
 def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
-    """Likewise what some robots live with."""
+    """Doubtful numbers that some robots train well with, in the same form."""
     dt, joints, lines = health.dt, health.joints, []
     if rings := [joint for joint in joints if joint.verdict(dt, health.implicit) == "rings"]:
         lines.append(
@@ -173,12 +173,13 @@ def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
 
 
 def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
-    """What keeps robots of a task from learning: a rule that ends every episode at once, gains that no training makes up for; and what may.
+    """Faults that prevent a task from learning, and doubtful numbers.
 
-    Random numbers go on as if it had not been called, and nothing that fails here is an error.
+    A fault is a rule that ends every episode at once, or gains that no training can compensate.
+    The random generators are restored. A failure of this check is not an error.
     """
     if not this_rank().leads:
-        return [], []  # one says it for all
+        return [], []  # one process reports for all
     control = task.cfg.control
     gains = control.actuator in ("servo", "dc_motor") and control.action_origin != "speed"
     with nothing_changed():
@@ -188,15 +189,18 @@ def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
             if gains:
                 health = measure(env.robot, env.robot.pose, env.start_place, control.decimation)
                 wrong, odd = faults(health), doubtful(health, suggest(health.joints, health.dt))
-        except Exception as error:  # a look that fails says nothing against the task
+        except Exception as error:  # a failed check is no fault of the task
             return [], [f"a few robots on their own could not be looked at: {in_short(error)}"]
     return [*([ends] if ends else []), *wrong], odd
 
 
 @torch.inference_mode()
 def first_step(env: RobotTask) -> str:
-    """Which rule ends every episode of ``env`` within a step of action zero, in words; '' if none does. Its worlds move on."""
-    for _ in range(3):  # of worlds that begin anywhere, all may end by chance
+    """The rule that ends every episode of ``env`` in one step with action zero, as text; '' if there is none.
+
+    It steps the worlds of ``env``.
+    """
+    for _ in range(3):  # repeat: with random starts, all worlds may end by chance
         env._reset_all()
         env.actions.zero_()
         env._apply_actions()
@@ -221,12 +225,15 @@ def _field(env: RobotTask, path: str) -> object:
 
 
 def few_robots(task: LoadedTask, servos: bool = True, plane: bool = True) -> tuple[RobotTask, bool]:
-    """Few robots of the task on a CPU, on ``servos`` or their own motors, on a ``plane`` or their own ground; and whether that is rough."""
+    """An environment with few robots of the task on a CPU, and whether the task's terrain is rough.
+
+    ``servos``: replace the task's motors by servos. ``plane``: replace its terrain by a plane.
+    """
     few = copy.deepcopy(task)
     few.cfg = tiny_cfg(task.cfg)
     kind: type[RobotTask] = task.env_class
     if servos:
-        few.set("control.actuator", "servo")  # what the page is about: gains, and what a simulation step makes of them
+        few.set("control.actuator", "servo")  # the page checks gains and their stability
         kind = type(kind.__name__, (kind,), {"_compute_torques": RobotTask._compute_torques})
     rough = few.cfg.to_dict()["terrain"].get("mesh_type", "plane") != "plane"
     if rough and plane:

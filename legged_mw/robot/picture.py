@@ -1,6 +1,6 @@
-"""Two pictures of the default pose side by side: feet, IMU frame, colliders and joint axes, each with its name.
+"""Two views of the default pose, side by side: feet, IMU frame, colliders and joint axes with their names.
 
-Names stand in columns beside the robot, with a line to what they name, so that those of 29 joints can be read.
+The names stand in columns beside the robot, with lines to their places, so the names of 29 joints are readable.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -28,11 +28,11 @@ from legged_mw.view.video import Frame, save_png
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
 VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]
-FILL = 0.7  # of a view's smaller edge that the robot takes; names have the rest
+FILL = 0.7  # share of a view's smaller edge for the robot; the names get the rest
 COLLIDER_RGBA, LOOK_ALPHA = (1.0, 0.55, 0.1, 0.42), 0.4
 FOOT_RGBA = (0.0, 0.75, 0.52, 1.0)
 AXES_RGB = ((0.95, 0.2, 0.2), (0.25, 0.85, 0.25), (0.3, 0.5, 1.0))  # x, y, z
-# of the families of joints: Okabe and Ito's palette and lighter ones, which the colour-blind tell apart
+# of the joint families: Okabe and Ito's palette with lighter versions, safe for the colour-blind
 FAMILY_RGB = (
     (0.34, 0.71, 0.91),
     (0.94, 0.89, 0.26),
@@ -42,25 +42,25 @@ FAMILY_RGB = (
     (0.75, 0.75, 0.95),
     (0.9, 0.9, 0.9),
 )
-MANY = 16  # joints: of more, arrows are shorter
-LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; between two names at least
+MANY = 16  # number of joints above which the arrows are shorter
+LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; least distance between two names
 CAPTION = "joint axes: arrows (turn by the right hand)   feet: green   imu: x red, y green, z blue   colliders: orange"
 
 Rgb = tuple[float, float, float]
 
 
 class Label(NamedTuple):
-    """A name, the place that it names, and arrows from there."""
+    """A name, its place on the robot, and arrows from that place."""
 
     text: str
-    place: FloatArray  # (3,) [m, world]
+    place: FloatArray  # (3,) [m, world frame]
     rgb: Rgb
-    # ends (3,) [m, world]; drawn over the picture, else the robot hides them
+    # ends (3,) [m, world frame]; drawn over the picture, else the robot would hide them
     arrows: tuple[tuple[FloatArray, Rgb], ...] = ()
 
 
 def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], title: str) -> None:
-    """Write the picture to ``path`` (PNG). ``feet``: name -> its geoms; ``qpos`` (7 + D,)."""
+    """Write the picture of the robot at ``qpos`` (7 + D,) to ``path`` (PNG). ``feet``: name -> geoms."""
     if path.suffix.lower() != ".png":
         raise ViewError(f"Cannot write {path.name!r}: the picture of a robot is a .png")
     scene = _Picture(robot, qpos, feet)
@@ -71,7 +71,7 @@ def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Seq
 
 
 class _Picture:
-    """One robot in its pose, drawn from several sides."""
+    """One posed robot, drawn from several sides."""
 
     def __init__(self, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]]) -> None:
         self.robot, self.feet = robot, feet
@@ -84,14 +84,14 @@ class _Picture:
         try:
             font = mujoco.mjtFontScale.mjFONTSCALE_150
             self._renderer = mujoco.Renderer(self.posed.model, height=HEIGHT, width=WIDTH, font_scale=font)
-        except Exception as error:  # each OpenGL backend fails with a type of its own
+        except Exception as error:  # each OpenGL backend raises another type
             raise ViewError(no_context(error)) from error
 
     def close(self) -> None:
         self._renderer.close()
 
     def view(self, name: str, azimuth: float, elevation: float, title: str) -> Frame:
-        """The robot from one side, with the names of the joints that are on the near one (of the first view, on the far one)."""
+        """The robot from one side, with joint names: of the near side in the second view, the others in the first."""
         camera, model = mujoco.MjvCamera(), self.posed.model
         camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
         camera.lookat[:], camera.distance = (
@@ -113,10 +113,10 @@ class _Picture:
                 _line(frame, self._project(label.place, camera), self._project(end, camera), rgb, wide=3)
         return frame
 
-    # ---- what is drawn ----
+    # ---- robot ----
 
     def _paint(self) -> None:
-        """Colliders orange, all else of the robot half transparent; what is neither is hidden."""
+        """Paint colliders orange and other parts of the robot half transparent. Hide everything else."""
         model = self.posed.model
         touching = {
             self.robot.physics.geom(g).name
@@ -135,7 +135,7 @@ class _Picture:
                 model.geom_rgba[geom, 3] = 0.0
 
     def _measure(self) -> None:
-        """Middle and diagonal [m] of the upright box around the robot."""
+        """Compute the centre and the diagonal [m] of the axis-aligned box around the robot."""
         model, data = self.posed.model, self.posed.data
         moving = np.flatnonzero((model.body_weldid[model.geom_bodyid] > 0) & (model.geom_rgba[:, 3] > 0))
         centre, half = boxes(model, data, moving)
@@ -155,7 +155,7 @@ class _Picture:
         return labels
 
     def _draw_feet(self) -> list[Label]:
-        """A disc under each foot, as the viewer draws one that stands."""
+        """Draw a disc under each foot, like the viewer's disc of a foot in contact."""
         labels, model = [], self.posed.model
         for name, geoms in self.feet.items():
             foot = patch(model, self.posed.data, [model.geom(geom).id for geom in geoms], self.posed.radius)
@@ -174,13 +174,13 @@ class _Picture:
         return [Label(self.robot.imu, place, (1.0, 1.0, 1.0), ends)]
 
     def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgb: Rgb) -> None:
-        end = place + 2.0 * length * axis  # half of it is drawn
+        end = place + 2.0 * length * axis  # MuJoCo draws half of the length
         connect(self._renderer.scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.009 * self.size, place, end, (*rgb, 1.0))
 
     # ---- names ----
 
     def _write(self, labels: list[Label], camera: mujoco.MjvCamera, title: str) -> Frame:
-        """Write names in two columns, and lines from them, over the picture that was just drawn; returns it."""
+        """Write names in two columns over the last picture, and draw their lines. Return the picture."""
         placed = _columns([(label, self._project(label.place, camera)) for label in labels])
         context, rect = self._renderer._mjr_context, self._renderer._rect
         lines = []
@@ -200,7 +200,7 @@ class _Picture:
         return frame
 
     def _project(self, place: FloatArray, camera: mujoco.MjvCamera) -> tuple[float, float]:
-        """Pixel (x from the left, y from the top) of ``place`` (3,) [m]."""
+        """The pixel (x from the left, y from the top) of ``place`` (3,) [m, world frame]."""
         azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
         forward = np.array(
             [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
@@ -212,7 +212,7 @@ class _Picture:
 
 
 def _columns(labels: list[tuple[Label, tuple[float, float]]]) -> list[tuple[Label, tuple[float, float], float, bool]]:
-    """Each label with its pixel, the row of its name [px from the top], and whether that is in the left column."""
+    """For each label: its pixel, the y of its name [px from the top], and whether its name is in the left column."""
     ordered, placed = sorted(labels, key=lambda each: each[1][0]), []
     half = len(ordered) // 2
     for left, column in ((True, ordered[:half]), (False, ordered[half:])):
@@ -222,19 +222,19 @@ def _columns(labels: list[tuple[Label, tuple[float, float]]]) -> list[tuple[Labe
         rows: list[float] = []
         for _, (_, y) in column:
             rows.append(max(y, rows[-1] + gap if rows else low))
-        for i in reversed(range(len(rows))):  # push up what ran out at the bottom
+        for i in reversed(range(len(rows))):  # push names up that are below the bottom
             rows[i] = min(rows[i], rows[i + 1] - gap if i + 1 < len(rows) else high)
         placed += [(label, pixel, row, left) for (label, pixel), row in zip(column, rows, strict=True)]
     return placed
 
 
 def _width(context: mujoco.MjrContext, text: str) -> int:
-    """[px]"""
+    """The width of the text [px]."""
     return sum(int(context.charWidth[ord(letter)]) for letter in text if ord(letter) < 127)
 
 
 def _text(context: mujoco.MjrContext, text: str, x: float, y: float, rgb: Rgb) -> None:
-    """Text whose first letter's middle is at the pixel (x, y from the top), with a dark edge."""
+    """Write text with a dark edge. The centre of its first letter is at the pixel (x, y from the top)."""
     for shift, colour in ((1.2, (0.0, 0.0, 0.0)), (0.0, rgb)):
         down = (HEIGHT - y - shift - 6) / HEIGHT
         mujoco.mjr_text(mujoco.mjtFont.mjFONT_NORMAL, text, context, (x + shift) / WIDTH, down, *colour)
@@ -243,7 +243,7 @@ def _text(context: mujoco.MjrContext, text: str, x: float, y: float, rgb: Rgb) -
 def _line(
     frame: NDArray[np.uint8], start: tuple[float, float], end: tuple[float, float], rgb: Rgb, wide: int = 1
 ) -> None:
-    """A line, half transparent, between two pixels; ``wide`` [px]."""
+    """Draw a half transparent line between two pixels. ``wide``: its width [px]."""
     steps = max(2, int(np.hypot(end[0] - start[0], end[1] - start[1])))
     x, y = (np.linspace(a, b, steps).round().astype(int) for a, b in zip(start, end, strict=True))
     steep = abs(end[1] - start[1]) > abs(end[0] - start[0])

@@ -1,4 +1,4 @@
-"""A URDF made ready for MuJoCo's own reader: mesh files found, unreadable looks left out, links without mass kept so."""
+"""Prepare a URDF for MuJoCo's reader: find mesh files, drop unreadable visuals, keep links without mass massless."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -15,15 +15,16 @@ from legged_mw.robot.meshes import READABLE, why_unreadable
 from legged_mw.robot.mjcf import XmlSource
 from legged_mw.utils.errors import ModelError
 
-_KNOWN = ("link", "joint", "material", "mujoco")  # what the reader needs; the rest is for other programs
+_KNOWN = ("link", "joint", "material", "mujoco")  # elements for the reader; the rest is for other programs
 _COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "false"}
 SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
 
 
 def read_urdf(source: XmlSource, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
-    """The spec, every link a body of its own, and joint -> speed limit [rad/s].
+    """The spec with one body per link, and joint -> speed limit [rad/s].
 
-    Its tree is changed for that. Raises ValueError for what is no URDF, ModelError for a mesh that collides and cannot be read.
+    It modifies the tree of ``source``. Raises ValueError for a file that is not a URDF, ModelError for an unreadable
+    collision mesh.
     """
     file, robot = source.file, source.root
     if any(element.tag.startswith("xacro:") for element in robot.iter()):
@@ -52,7 +53,7 @@ def read_urdf(source: XmlSource, notes: list[str]) -> tuple[mujoco.MjSpec, dict[
 
 
 def _drop_places(robot: Element, notes: list[str]) -> None:
-    """Leave out root links that only say where other programs put the robot, one after the other."""
+    """Drop root links that only place the robot for other programs, one after another."""
     children = {_end(joint, "child") for joint in robot.findall("joint")}
     for link in [link for link in robot.findall("link") if link.get("name") not in children]:
         held = [joint for joint in robot.findall("joint") if _end(joint, "parent") == link.get("name")]
@@ -70,7 +71,7 @@ def _end(joint: Element, which: str) -> str | None:
 
 
 def _leads_elsewhere(joint: Element) -> bool:
-    """Whether an empty link above the joint, as base_footprint is on the ground, is not where the robot is."""
+    """Whether the joint moves the robot away from an empty link above it, such as base_footprint on the ground."""
     origin = joint.find("origin")
     numbers = [] if origin is None else f"{origin.get('xyz', '')} {origin.get('rpy', '')}".split()
     return joint.get("type") == "floating" or (
@@ -79,7 +80,7 @@ def _leads_elsewhere(joint: Element) -> bool:
 
 
 def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
-    """Leave out looks without a size, which MuJoCo does not compile. Raises ModelError for such a thing that collides."""
+    """Drop visuals of size zero, which MuJoCo does not compile. Raises ModelError for a collider of size zero."""
     left_out: list[str] = []
     for link in robot.findall("link"):
         for part in [part for part in [*link.findall("visual"), *link.findall("collision")] if _has_no_size(part)]:
@@ -95,7 +96,7 @@ def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
 
 def _has_no_size(part: Element) -> bool:
     shape = part.find("geometry/*")
-    with suppress(ValueError):  # what is no number is MuJoCo's to say
+    with suppress(ValueError):  # MuJoCo reports text that is not a number
         if shape is not None and shape.tag != "mesh":
             return any(
                 not float(number) for name in ("radius", "length", "size") for number in shape.get(name, "").split()
@@ -104,7 +105,7 @@ def _has_no_size(part: Element) -> bool:
 
 
 def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path]:
-    """Give each mesh a name of its own, and return name -> file; looks without a readable file are removed."""
+    """Give each mesh a unique name, and return name -> file. Remove visuals without a readable file."""
     compiler, names = robot.find("mujoco/compiler"), dict[Path, str]()
     meshdir = "" if compiler is None else compiler.get("meshdir", "")
     left_out: dict[str, list[str]] = {}
@@ -132,7 +133,7 @@ def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path
 
 
 def _resolve(asked: str, file: Path, meshdir: str) -> Path:
-    """The file that a URDF means: package:// is the folder of that name above it, or else any folder above it."""
+    """The path of a mesh in a URDF. package:// is the folder of that name above the URDF, else any folder above it."""
     here = file.resolve().parent
     scheme, _, rest = asked.rpartition("://")
     if scheme == "file":
@@ -148,7 +149,7 @@ def _resolve(asked: str, file: Path, meshdir: str) -> Path:
 
 
 def _set_looks(spec: mujoco.MjSpec) -> None:
-    """What collides is drawn only where a link has no other looks; a link without <inertial> has no mass."""
+    """Hide colliders of links with visuals. Give links without <inertial> no mass."""
     for body in spec.bodies:
         seen = any(not (geom.contype or geom.conaffinity) for geom in body.geoms)
         for geom in body.geoms:

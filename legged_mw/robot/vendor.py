@@ -1,6 +1,6 @@
-"""Any robot's file, unedited: a vendor's MJCF or URDF becomes a ``RobotFile``, as sim/ reads a plain MJCF.
+"""Read a vendor's MJCF or URDF, unedited, as a ``RobotFile``.
 
-``RobotFile.notes`` lists what is dropped, added or renamed. Host only; nothing is stepped.
+``RobotFile.notes`` lists dropped, added and renamed elements. Runs on the host only, without simulation.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -34,9 +34,9 @@ from legged_mw.sim.robot_file import (
 from legged_mw.utils.errors import ModelError
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
-_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
+_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # number of columns in qpos; other joints have one
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_ADDED = {  # attributes of defaults that would apply to what is added to the robot
+_ADDED = {  # attributes of defaults that would apply to elements added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
     "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
@@ -49,7 +49,7 @@ _OURS = {"geoms": SCENE, "hfields": SCENE, "materials": SCENE, "textures": SCENE
 
 
 def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
-    """Read an MJCF or URDF; keep its sensors called as ``wanted``. Raises ModelError for what is none, or cannot be a robot alone."""
+    """Read an MJCF or URDF, and keep its sensors named in ``wanted``. Raises ModelError if it is not a single robot."""
     if not file.is_file():
         raise ModelError(f"no {kind_of(file)} at {file}")
     where, notes = file.name, []
@@ -75,7 +75,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:
-    """Where the file takes all inertias from geoms, delete those that it writes: then looks can be left out later."""
+    """Delete explicit inertias if the file computes all inertias from geoms. Then visuals can be dropped later."""
     kinds = mujoco.mjtInertiaFromGeom
     if spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
         spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
@@ -86,9 +86,10 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
 
 
 def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
-    """Joint -> lowest and highest force at the joint [N m]; the file's actuators are removed.
+    """Remove the file's actuators. Return joint -> lowest and highest force at the joint [N m].
 
-    A joint's own range wins; next an actuator's forcerange through its gear; last a motor's ctrlrange through gain and gear.
+    First choice is the joint's force range, second an actuator's forcerange times gear, third a motor's ctrlrange times
+    gain and gear.
     """
     limits = joint_limits(spec)
     if actuators := list(spec.actuators):
@@ -103,7 +104,7 @@ def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
 
 
 def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
-    """An actuator's force range at the joint [N m]; None if it has none, or if only a simulation can tell."""
+    """An actuator's force range at the joint [N m]; None if it has none, or if it depends on the state."""
     if is_limited(actuator.forcelimited, actuator.forcerange):
         return actuator.forcerange * actuator.gear[0]
     is_motor = actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
@@ -113,7 +114,7 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
 
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
-    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
+    """The keyframe "home", or the only one. All keyframes are removed, because they would not match the new servos."""
     keys, taken = list(spec.keys), None
     chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
     qpos = list(chosen.qpos) if chosen else []
@@ -145,7 +146,7 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
 
 
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
-    """Keep sensors that feel contact and those that are ``wanted``; the state tells the rest."""
+    """Keep contact sensors and ``wanted`` sensors. The state has the values of all others."""
     kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS.split()}
     if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept and sensor.name not in wanted]:
         notes.append(
@@ -156,7 +157,7 @@ def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]
 
 
 def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
-    """Drop the file's ground, things, lights, cameras and sky, and what ties the robot to them."""
+    """Drop the file's ground, objects, lights, cameras and sky, and constraints between them and the robot."""
     for body in [body for body in spec.worldbody.bodies if not _has_joints(body) and _has_joints(spec.worldbody)]:
         notes.append(f"body '{body.name}' of the world dropped: it has no joint")
         spec.delete(body)
@@ -185,7 +186,7 @@ def _has_joints(body: mujoco.MjsBody) -> bool:
 
 
 def _drop_unused(spec: mujoco.MjSpec) -> None:
-    """Delete height fields, materials and textures that only the ground used."""
+    """Delete height fields, materials and textures that only the ground uses."""
     for hfield in [field for field in spec.hfields if field.name not in {geom.hfieldname for geom in spec.geoms}]:
         spec.delete(hfield)
     worn = {thing.material for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons)}
@@ -197,7 +198,7 @@ def _drop_unused(spec: mujoco.MjSpec) -> None:
 
 
 def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Drop pairs of geoms, and whatever holds the robot to the world or to dropped things."""
+    """Drop geom pairs, and constraints that hold the robot to the world or to dropped objects."""
     bodies, sites = {body.name for body in spec.bodies} - {"world"}, {site.name for site in spec.sites}
     for pair in list(spec.pairs):
         notes.append(f"contact pair of '{pair.geomname1}' and '{pair.geomname2}' dropped")
@@ -214,7 +215,7 @@ def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def _forget_defaults(spec: mujoco.MjSpec) -> None:
-    """Reset the main defaults: the file's elements have them by now, and what is added later needs MuJoCo's own."""
+    """Reset the main defaults. The file's elements already have them; elements added later need MuJoCo's defaults."""
     fresh = mujoco.MjSpec().default
     for kind, names in _ADDED.items():
         for name in names.split():
@@ -245,7 +246,7 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
 
 
 def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Let MuJoCo replace principal moments that violate A + B >= C by their mean, and say so."""
+    """Let MuJoCo replace principal moments of inertia that violate A + B >= C by their mean, and note that."""
     for body in [body for body in spec.bodies if body.explicitinertial]:
         full = body.fullinertia
         if np.isnan(full[0]):
@@ -264,7 +265,7 @@ def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def _rename_clashes(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Rename what the file calls as we call something of our own."""
+    """Rename elements of the file that clash with our own names."""
     renamed: dict[str, dict[str, str]] = {}
     for kind, ours in _OURS.items():
         taken, new = {thing.name for thing in getattr(spec, kind)}, renamed.setdefault(kind, {})

@@ -1,1 +1,1 @@
-"""Programs around training: what this machine can do, many runs beside each other, kernels ahead of time, the shell's Tab key."""
+"""Programs around training: check the machine, sweep and compare runs, compile kernels, complete shell commands."""

@@ -16,14 +16,14 @@ from legged_mw.utils.machine import has_display
 from legged_mw.utils.task import LoadedTask
 from legged_mw.view.follow import PLAYING
 
-_SECONDS = 15.0  # between two policies for the viewer
+_SECONDS = 15.0  # between two saves of the policy for the viewer
 
 
 def watch(task: LoadedTask, runner: Runner, folder: Path) -> None:
-    """Open the viewer on a run that begins: a window, or without a screen a web page. It closes with the training."""
+    """Open the viewer of a starting run: a window, or without a screen a web page. It closes with the training."""
     if not checkpoints(folder):
         try:
-            runner.save(str(folder / "model_0.pt"))  # what a viewer can begin with
+            runner.save(str(folder / "model_0.pt"))  # the viewer's first policy
         except (OSError, MemoryError) as error:
             print(f"WARNING: no viewer opens: cannot write model_0.pt ({reason_of(error)})", flush=True)
             return
@@ -47,7 +47,7 @@ def watch(task: LoadedTask, runner: Runner, folder: Path) -> None:
     ]
     if hasattr(os, "nice"):
         command = ["nice", "-n", "10", *command]
-    # in a session of its own, so that Ctrl-C asks the training alone; it ends us from there
+    # in a separate session, so that Ctrl-C reaches only the training, which then ends the viewer
     viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
     atexit.register(_end, viewer, folder / PLAYING)
     shown = time.monotonic()

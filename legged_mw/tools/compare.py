@@ -17,15 +17,15 @@ from legged_mw.utils.errors import UserError, shown
 # ---- a line chart as SVG --------------------------------------------------------------------------------------------
 
 
-WIDTH, HEIGHT = 340, 210  # of the drawing, in its own units
+WIDTH, HEIGHT = 340, 210  # of the drawing, in SVG units
 LEFT, RIGHT, TOP, BOTTOM = 46, 10, 24, 34
-POINTS = 120  # of a curve at most: neighbours are averaged
+POINTS = 120  # most points of a curve: neighbours are averaged
 
 Line = tuple[str, Sequence[float], Sequence[float]]  # colour, x, y
 
 
 def chart(title: str, over: str, lines: Sequence[Line]) -> str:
-    """The lines on common axes; "" if none has a point."""
+    """An SVG chart of the lines on common axes; "" if no line has a point."""
     thinned = [(colour, thin(list(zip(x, y, strict=True)))) for colour, x, y in lines]
     points = [point for _, line in thinned for point in line]
     if not points:
@@ -64,7 +64,7 @@ def _dot(colour: str, at: tuple[float, float]) -> str:
 
 
 def thin(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """At most ``POINTS`` means of neighbouring points; those that are not finite are left out."""
+    """At most ``POINTS`` points, each the mean of neighbours. Points that are not finite are left out."""
     points = [point for point in points if all(map(math.isfinite, point))]
     size = math.ceil(len(points) / POINTS) or 1
     groups = [points[i : i + size] for i in range(0, len(points), size)]
@@ -72,7 +72,7 @@ def thin(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """Round numbers around ``low`` to ``high``, about so many."""
+    """About ``count`` round numbers that span ``low`` to ``high``."""
     if high - low < 1e-12 * max(abs(low), abs(high), 1e-300):
         room = abs(high) / 2 or 1.0
         low, high = low - room, high + room
@@ -90,8 +90,8 @@ def short(value: float) -> str:
     return f"{value:.6g}"
 
 
-LONGEST = 40  # letters of a setting in a table
-MOST = 8  # colours that one can tell apart (Okabe and Ito's)
+LONGEST = 40  # [characters] longest setting in a table
+MOST = 8  # number of distinct colours (Okabe and Ito's)
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#68707d")
 ON_DARK = ("#56b4e9", "#ff8a3d", "#2fc99b", "#e6a5c9", "#f0c04a", "#9fd4f5", "#c9a66b", "#9aa3b0")
 STYLE = f""":root{{{"".join(f"--run{i}:{colour};" for i, colour in enumerate(COLOURS))}}}
@@ -100,7 +100,7 @@ STYLE = f""":root{{{"".join(f"--run{i}:{colour};" for i, colour in enumerate(COL
 figure path{{fill:none;stroke-width:1.6;stroke-linejoin:round}}figure line{{stroke:var(--faint)}}"""
 TOTAL = "Train/total_steps"
 FIRST = ("Train/mean_reward", "Train/mean_episode_length", "Episode/fell", "Policy/mean_std", "Perf/total_fps")
-CHAPTERS = {  # what a curve's name begins with -> title; later ones are folded away
+CHAPTERS = {  # prefix of a curve's name -> title; later chapters are folded
     "Exam/": "Exams during training",
     "Train/": "Training",
     "Curriculum/": "Curriculum",
@@ -138,7 +138,7 @@ def main() -> None:
 
 
 def write(runs: Sequence[Run], path: Path, over: str = "steps") -> None:
-    """The page. Raises UserError if it cannot be written."""
+    """Write the page. Raises UserError if it cannot be written."""
     try:
         path.write_text(html(runs, over), encoding="utf-8")
     except OSError as error:
@@ -146,13 +146,13 @@ def write(runs: Sequence[Run], path: Path, over: str = "steps") -> None:
 
 
 def steps_an_iteration(run: Run) -> float:
-    """Of the last iteration: its number is what the total was divided into."""
+    """Steps per iteration: the last total of steps, divided by the number of iterations."""
     total = run.last(TOTAL)
     return total / run.iterations if total and run.iterations else math.nan
 
 
 def figures(runs: Sequence[Run]) -> dict[str, tuple[str, list[float | None]]]:
-    """How long each of ``runs`` trained, and its last figures: name -> (how it is written, a value a run)."""
+    """Training times and last figures of ``runs``: name -> (number format, one value per run)."""
     exams = list(dict.fromkeys(name for run in runs for name in run.curves if name.startswith("Exam/")))
     last = {"steps/s": ("Perf/total_fps", ",.0f"), "reward": ("Train/mean_reward", ".2f")}
     last |= {name.removeprefix("Exam/"): (name, ".3f") for name in exams}
@@ -165,14 +165,14 @@ def figures(runs: Sequence[Run]) -> dict[str, tuple[str, list[float | None]]]:
 
 
 def rows(runs: Sequence[Run]) -> list[list[str]]:
-    """A row a run: what it is, and its ``figures``."""
+    """A header, then one row per run: its name and its ``figures``."""
     found = figures(runs)
     columns = [["-" if value is None else f"{value:{digits}}" for value in values] for digits, values in found.values()]
     return [["run", *found], *([run.name, *line] for run, *line in zip(runs, *columns, strict=True))]
 
 
 def text_table(lines: Sequence[Sequence[str]]) -> str:
-    """``rows`` for a terminal."""
+    """``rows`` as text for a terminal."""
     first, *widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     cells = [[cell.rjust(width) for cell, width in zip(line[1:], widths, strict=True)] for line in lines]
     return "\n".join("  ".join([line[0].ljust(first), *right]) for line, right in zip(lines, cells, strict=True))
@@ -218,7 +218,7 @@ def _said(value: object) -> str:
 
 
 def _chapters(runs: Sequence[Run], over: str) -> Iterable[str]:
-    """Charts by what their curves are about; the common ones open, the others folded."""
+    """The charts, grouped by the prefixes of their curves. Common groups are open, the others folded."""
     names = sorted(dict.fromkeys(name for run in runs for name in run.curves if name != TOTAL), key=_order)
     for chapter, group in groupby(names, key=_chapter):
         drawn = [
@@ -240,7 +240,7 @@ def _order(name: str) -> tuple[int, int, str]:
 
 
 def _lines(runs: Sequence[Run], name: str, over: str) -> list[tuple[str, list[float], list[float]]]:
-    """(colour, x, y) of each run that has the curve."""
+    """(colour, x, y) for each run that has the curve."""
     found = []
     for i, run in enumerate(runs):
         if name in run.curves:

@@ -38,21 +38,21 @@ _FILES = "$(ls *.py 2>/dev/null)"
 
 
 class _Caught(BaseException):
-    """A program's parser, caught where it would read the command line."""
+    """Carries a program's parser out of its start, just before it reads the command line."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self.parser = parser
 
 
 def main(programs: Mapping[str, Callable[[], None]]) -> None:
-    """Print the script that completes ``programs``."""
+    """Print the completion script for ``programs``."""
     parser = Parser(prog="legged-mw completion", description=__doc__, allow_abbrev=False)
     parser.add_argument("shell", choices=("bash", "zsh"))
     print(script(parser.parse_args().shell, programs))
 
 
 def script(shell: str, programs: Mapping[str, Callable[[], None]]) -> str:
-    """The script that the shell evaluates."""
+    """The completion script for the shell."""
     tasks = " ".join(task_names())
     policies = " ".join(sorted(path.parent.name for path in (ROOT / "resources/policies").glob("*/policy.onnx")))
     cases = [
@@ -76,13 +76,13 @@ def script(shell: str, programs: Mapping[str, Callable[[], None]]) -> str:
 
 
 def fields() -> list[str]:
-    """Dotted path of every config field that any of the tasks has."""
+    """The dotted paths of the config fields of all tasks."""
     tasks = map(load_task, task_names())
     return sorted({path for task in tasks for cfg in (task.cfg, task.train) for path, _ in field_types(type(cfg))})
 
 
 def parser_of(name: str, start: Callable[[], None]) -> argparse.ArgumentParser:
-    """The parser with which a program reads its flags, caught as it begins to."""
+    """The parser of a program's flags. It is caught at the call of ``parse_args``."""
 
     def caught(self: argparse.ArgumentParser, *_: Any, **__: Any) -> NoReturn:
         raise _Caught(self)

@@ -11,33 +11,33 @@ from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown
 
 CONFIG_FILE = "config.yaml"
-PAUSE = 60.0  # [s] ours: an iteration that took longer was resumed, or waited for something
+PAUSE = 60.0  # [s] ours: a longer iteration includes a pause, such as before a resume
 AXES, AXES_OF = ("vx", "vy", "yaw rate"), ("error", "worst", "offset")
-REPORT = "eval/report.json"  # what play --eval leaves in a run's folder
+REPORT = "eval/report.json"  # written by play --eval into the run's folder
 
 
 class Run(NamedTuple):
-    """A run: its settings by dotted path, its curves by name: (iterations, values), both as long as there are points."""
+    """A run: its settings by dotted path, and its curves by name: (iterations, values), of equal length."""
 
     name: str
     folder: Path
     settings: dict[str, Any]
     curves: dict[str, tuple[list[float], list[float]]]
-    seconds: dict[float, float]  # iteration -> seconds of training by then, pauses left out
-    graded: dict[str, float]  # figures of the whole exam, if one was taken
+    seconds: dict[float, float]  # iteration -> [s] of training up to it, without pauses
+    graded: dict[str, float]  # figures of the whole exam; empty without one
 
     @property
     def iterations(self) -> int:
         return int(max(self.seconds, default=0))
 
     def last(self, curve: str) -> float | None:
-        """The last value of a curve."""
+        """The last value of a curve; None without one."""
         values = self.curves.get(curve, ([], []))[1]
         return values[-1] if values else None
 
 
 def find_runs(names: list[str]) -> list[Run]:
-    """The runs that a user names by path, as TASK/RUN, or by a task for its last run. Raises ConfigError."""
+    """The runs with these names: a path, TASK/RUN, or a task for its last run. Raises ConfigError."""
     folders = [_find(name) for name in names]
     together = [folder.resolve().parent for folder in folders]
     alone = len({folder.name for folder in folders}) == len(folders) and len(set(together)) == 1
@@ -66,8 +66,8 @@ def _events(folder: Path) -> list[Path]:
 
 
 def read_run(folder: Path, name: str) -> Run:
-    """All of a run's curves. Of an iteration that was trained twice, after a resume, the later one counts."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # half a second to import
+    """All curves of a run. If a resumed run repeated an iteration, the later values count."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # takes 0.5 s to import
 
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
@@ -86,7 +86,7 @@ def read_run(folder: Path, name: str) -> Run:
 
 
 def _graded(report: Path) -> dict[str, float]:
-    """Plain figures of the exam in a report; "" and what is not a number are left out."""
+    """The numeric figures of the exam in a report; empty without a report."""
     try:
         exam = json.loads(report.read_text(encoding="utf-8"))["columns"][0]["exam"]
     except (OSError, ValueError, LookupError, TypeError):
@@ -102,14 +102,14 @@ def _graded(report: Path) -> dict[str, float]:
 
 
 def _flat(values: Any, path: str = "") -> list[tuple[str, Any]]:
-    """(dotted path, value) of all leaves; lists are leaves."""
+    """(dotted path, value) of all leaves. A list is a leaf."""
     if isinstance(values, dict):
         return [leaf for key, item in values.items() for leaf in _flat(item, f"{path}.{key}" if path else str(key))]
     return [(path, values)]
 
 
 def differences(runs: list[Run]) -> dict[str, list[Any]]:
-    """Dotted path -> a value a run, of every setting in which the runs differ; None where a run has no such setting."""
+    """The settings in which runs differ: dotted path -> one value per run, None if the run lacks the setting."""
     paths = dict.fromkeys(path for run in runs for path in run.settings)
     table = {path: [run.settings.get(path) for run in runs] for path in paths}
     return {path: values for path, values in table.items() if any(value != values[0] for value in values)}

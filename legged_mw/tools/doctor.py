@@ -24,23 +24,23 @@ from legged_mw.utils.machine import gl_fault, has_display, usable_cores
 from legged_mw.utils.task import load_task, task_names
 
 SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")
-# where legged_mw is only on the path
+# used if legged_mw is on the path but not installed
 _LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict")
 _CUDA_WHEELS = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu130"
 _DRAW = "import mujoco\nc = mujoco.GLContext(64, 64)\nc.make_current()\nmujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
 
 
 class Finding(NamedTuple):
-    """One line of the page. ``mend`` is a command or what to do, where something is missing."""
+    """One line of the page. ``mend``: the command or advice that fixes it; empty if nothing is missing."""
 
     what: str
     said: str
     mend: str = ""
-    needed: bool = False  # nothing trains without it
+    needed: bool = False  # required for training
 
 
 def parse() -> tuple[str | None, float]:
-    """The device, and the seconds to spend on speed."""
+    """Parse the flags: the device, and the duration of the speed test [s]."""
     parser = Parser(prog="legged-mw doctor", description=__doc__, allow_abbrev=False)
     parser.add_argument(
         "--device", metavar="D", help="what to measure on: cuda:0, cpu (default: the GPU if there is one)"
@@ -83,7 +83,7 @@ def main() -> None:
 
 
 def machine() -> Iterator[Finding]:
-    """Python, cores, memory, disk, where the package is."""
+    """Python, cores, memory, disk, location of the package."""
     version = platform.python_version()
     fits = (3, 11) <= sys.version_info[:2] <= (3, 13)
     yield Finding(
@@ -117,7 +117,7 @@ def machine() -> Iterator[Finding]:
 
 
 def training() -> Iterator[Finding]:
-    """The libraries that step and learn, each in the range that this version was tested with."""
+    """The libraries for simulation and learning, and whether their versions are in the tested range."""
     for text in metadata.requires("legged_mw") or [] if _version("legged_mw") else _LIBRARIES:
         needs = Requirement(text)
         if needs.marker is None:
@@ -133,7 +133,7 @@ def training() -> Iterator[Finding]:
 
 
 def gpus() -> Iterator[Finding]:
-    """Each GPU: driver, memory pool, graphs, kernels, who else is on it."""
+    """For each GPU: driver, memory pool, graphs, kernels, other processes."""
     import torch
 
     from legged_mw.sim.device import device_facts
@@ -163,7 +163,7 @@ def gpus() -> Iterator[Finding]:
 
 
 def pictures() -> Iterator[Finding]:
-    """What MuJoCo can draw through, and what can be watched and recorded."""
+    """MuJoCo's OpenGL backends, viewers and video encoders."""
     chosen = os.environ.get("MUJOCO_GL", "")
     works = []
     for name in ("egl", "osmesa", "glfw"):
@@ -186,7 +186,7 @@ def pictures() -> Iterator[Finding]:
 
 
 def extras() -> Iterator[Finding]:
-    """What only some programs need, and nobody has to mend."""
+    """Optional libraries of single programs."""
     for package, extra, what in (
         ("onnxruntime", "deploy", "runs an export"),
         ("cyclonedds", "unitree", "drives a Go2 or G1"),
@@ -201,7 +201,7 @@ def extras() -> Iterator[Finding]:
 
 
 def draws(name: str) -> str:
-    """Why MuJoCo cannot draw a picture with this MUJOCO_GL; "" if it can. In another process: it may crash."""
+    """The reason why MuJoCo cannot draw with this MUJOCO_GL; "" if it can. Tested in another process: it may crash."""
     environment = {**os.environ, "MUJOCO_GL": name}
     environment.pop("PYOPENGL_PLATFORM", None)
     try:
@@ -215,7 +215,7 @@ def draws(name: str) -> str:
 
 
 def _records(device: str) -> str:
-    """Whether torch and warp record into one graph there."""
+    """Whether torch and warp can record one common CUDA graph, as text."""
     import torch
 
     from legged_mw.sim.graph import StepGraph
@@ -229,13 +229,13 @@ def _records(device: str) -> str:
     try:
         for _ in range(5):
             graph()
-    except Exception as error:  # whatever a driver may say
+    except Exception as error:  # any error of a driver
         return f"cannot be recorded: {' '.join(str(error).split())[:100]}"
     return "recorded and replayed" if graph.recorded and int(counter) == 5 else "not replayed"
 
 
 def speed(name: str, device: str, seconds: float) -> str:
-    """Train a task for so long and say how fast that was, and how long the whole training would take."""
+    """Train a task for ``seconds``. Return its speed and the estimated time of the whole training, as text."""
     import torch
 
     from legged_mw.rl.learner_config import fit_cpu
@@ -250,7 +250,7 @@ def speed(name: str, device: str, seconds: float) -> str:
     with contextlib.redirect_stdout(quiet):
         env = task.env_class(task.cfg, device)
         runner = make_runner(env, task.train, None, device)
-        runner.learn(5 if device != "cpu" else 1)  # records, and tries threads
+        runner.learn(5 if device != "cpu" else 1)  # warm-up: recording, choice of the number of threads
         start, done = time.perf_counter(), 0
         while done == 0 or time.perf_counter() < begun + seconds:
             runner.learn(4 if device != "cpu" else 1, init_at_random_ep_len=False)

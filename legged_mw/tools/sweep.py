@@ -29,14 +29,14 @@ from legged_mw.utils.cli import Parser, apply_overrides
 from legged_mw.utils.errors import shown
 from legged_mw.utils.task import load_task
 
-STOPPED = 3  # exit code of a training that a signal ended: rl/training.py's
+STOPPED = 3  # exit code of a training run that a signal ended, from rl/training.py
 TRAIN = [sys.executable, "-m", "legged_mw.programs", "train"]
-_PDEATHSIG = 1  # of Linux's prctl
+_PDEATHSIG = 1  # option of Linux's prctl
 Start = Callable[[list[str]], tuple[int, str, str]]  # flags of train -> exit code, run folder or "", last line
 
 
 class Cell(NamedTuple):
-    """One training: what is varied in it, field -> value."""
+    """One training run: its varied fields, field -> value."""
 
     varied: dict[str, str]
     flags: list[str]
@@ -47,22 +47,22 @@ class Cell(NamedTuple):
 
 
 class Stop:
-    """Whether a signal has asked the sweep to end; the training that runs is asked to save, with SIGTERM."""
+    """Ends the sweep at a signal. The current training run gets SIGTERM, so that it saves."""
 
     def __init__(self) -> None:
         self.asked = False
         self.training: subprocess.Popen[str] | None = None
 
     def listen(self) -> None:
-        """For Ctrl-C, SIGTERM and a hang-up, but for those that are ignored: nohup has it so."""
+        """Handle Ctrl-C, SIGTERM and SIGHUP, except signals that are ignored, as under nohup."""
         for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)  # no SIGHUP on Windows
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
             if number and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self)
 
     def __call__(self, *_: object) -> None:
         first, self.asked = not self.asked, True
-        # a closing terminal hangs up twice, and a training takes a second SIGTERM as: at once
+        # send it once: a closing terminal sends SIGHUP twice, and a second SIGTERM would stop the run at once
         if first and self.training:
             self.training.terminate()
 
@@ -103,7 +103,7 @@ def main() -> None:
 
 
 def values(text: str) -> list[str]:
-    """Split at commas that stand in no brackets and no quotes."""
+    """Split at commas outside brackets and quotes."""
     parts, depth, quote = [""] if text else [], 0, ""
     for letter in text:
         quote = "" if letter == quote else letter if letter in "\"'" and not quote else quote
@@ -116,7 +116,7 @@ def values(text: str) -> list[str]:
 
 
 def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
-    """Every combination; the seeds change fastest."""
+    """All combinations. The seed varies fastest."""
     axes = [
         [(path, value) for value in values(text) or [""]]
         for path, _, text in (item.partition("=") for item in settings)
@@ -133,14 +133,14 @@ def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
 
 
 def check(cells: Sequence[Cell], common: list[str]) -> None:
-    """Read the flags and every value once, as train would; raises UserError, or ends the program, for a wrong one."""
+    """Parse all flags and values once, as train does. Raises UserError, or ends the program, for an invalid one."""
     args = flags.parse(None, common)
     args.set += dict.fromkeys(text for cell in cells for text in cell.flags if text != "--set")
     apply_overrides(load_task(args.task, say=True), args)
 
 
 def train_all(cells: Sequence[Cell], common: list[str], start: Start, stop: Stop) -> list[tuple[Cell, Run]]:
-    """Train each; one that fails is said and left out, and a signal ends the sweep after the training that it stops."""
+    """Train all cells. Report and skip a failed run. A signal stops the current run and then the sweep."""
     found = []
     for number, cell in enumerate(cells, 1):
         if stop.asked:
@@ -157,7 +157,7 @@ def train_all(cells: Sequence[Cell], common: list[str], start: Start, stop: Stop
 
 
 def start(flags: list[str], stop: Stop) -> tuple[int, str, str]:
-    """``legged-mw train`` in a process of its own, which ends with this one; in a terminal its last line is shown meanwhile."""
+    """Run ``legged-mw train`` in a child process that ends with this one. A terminal shows its last line."""
     folder, said, live = "", "", sys.stdout.isatty()
     with (
         tempfile.TemporaryFile("w+") as errors,
@@ -166,7 +166,7 @@ def start(flags: list[str], stop: Stop) -> tuple[int, str, str]:
         ) as process,
     ):
         stop.training = process
-        if stop.asked:  # meanwhile
+        if stop.asked:  # a signal came before the process started
             process.terminate()
         assert process.stdout is not None
         for line in process.stdout:
@@ -183,21 +183,21 @@ def start(flags: list[str], stop: Stop) -> tuple[int, str, str]:
 
 
 def _end_with(parent: int) -> Callable[[], object] | None:
-    """What a child runs first, so that SIGTERM comes to it when ``parent`` is gone, however that ended. On Linux alone."""
+    """The first function of a child, so that it gets SIGTERM at any end of ``parent``. None if not on Linux."""
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
 
     def first() -> None:
         prctl(_PDEATHSIG, int(signal.SIGTERM))
-        if os.getppid() != parent:  # it went before
+        if os.getppid() != parent:  # the parent has already ended
             os._exit(1)
 
     return first
 
 
 def table(found: Sequence[tuple[Cell, Run]]) -> str:
-    """A line a training; where seeds were varied, below them the mean of each setting, and its standard deviation."""
+    """One line per run. With several seeds, then mean and standard deviation for each setting."""
     fields = list(dict.fromkeys(path for cell, _ in found for path in cell.varied))
     (_, *heads), *lines = rows(runs := [run for _, run in found])
     short = [path.rpartition(".")[2] for path in fields]
@@ -222,7 +222,10 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
 
 
 def _mean(digits: str, values: Sequence[float | None]) -> str:
-    """Mean and standard deviation, with the figure's ``digits``, or as many as two of the deviation need; "-" if not all have it."""
+    """Mean and standard deviation as text; "-" if a value is missing.
+
+    It has the figure's ``digits``, or more to show two digits of the deviation.
+    """
     numbers = [value for value in values if value is not None and math.isfinite(value)]
     if len(numbers) < len(values):
         return "-"

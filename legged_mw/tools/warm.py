@@ -18,8 +18,8 @@ from legged_mw.utils.cli import Parser, pick_device
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import load_task, task_names
 
-_FEW = 8  # worlds of mujoco-warp on a CPU
-_STEPS = 5  # three before the step is recorded, two replays
+_FEW = 8  # number of worlds for mujoco-warp on a CPU
+_STEPS = 5  # three before the step is recorded, then two replays
 
 
 def main() -> None:
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def warm(name: str, device: str) -> None:
-    """Train a task for an iteration, and step its exam: all kernels that its training launches."""
+    """Train a task for one iteration and step its exam, which compiles all kernels of its training."""
     task = load_task(name, say=True)
     if device == "cpu":
         fit_cpu(task, usable_cores())
@@ -54,7 +54,7 @@ def warm(name: str, device: str) -> None:
     exam = make_exam(task, env)
     if kernels := kernels_for(env.actions):
         kernels.load(device)
-    if not task.train.distillation.teacher:  # which a task of its own would have to train first
+    if not task.train.distillation.teacher:  # a student needs a teacher that is already trained
         with redirect_stdout(StringIO()):
             make_runner(env, task.train, None, device).learn(1)
     for each in [env, *([exam.env] if exam else [])]:
@@ -62,7 +62,7 @@ def warm(name: str, device: str) -> None:
 
 
 def warm_engine(name: str) -> None:
-    """The kernels of a task's step in mujoco-warp on a CPU: they are the same for few worlds."""
+    """Compile the kernels of a task's step in mujoco-warp on a CPU. They do not depend on the number of worlds."""
     task = load_task(name)
     task.set("sim.engine", "mujoco_warp")
     task.set("env.num_envs", _FEW)
@@ -70,6 +70,6 @@ def warm_engine(name: str) -> None:
 
 
 def _step(env: RobotTask) -> None:
-    """A few steps, until the step is recorded."""
+    """Do a few steps, until the step is recorded."""
     for _ in range(_STEPS):
         env.step(torch.zeros_like(env.actions))

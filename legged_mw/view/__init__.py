@@ -1,1 +1,4 @@
-"""Watching and driving robots: a stage that moves, viewers that show it, a pilot. numpy, mujoco and yaml; torch in env_stage.py alone."""
+"""Watch and drive robots: a stage simulates, a viewer shows it, a pilot holds the user's input.
+
+Needs numpy, mujoco and yaml. Only env_stage.py imports torch.
+"""

@@ -1,4 +1,4 @@
-"""Moves an `MjvCamera`: it follows the chosen robot, stays behind it, or sees all robots, and looks over hills."""
+"""Moves an `MjvCamera`: follow a robot, stay behind it, or show all robots. It looks over hills."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -13,36 +13,37 @@ from legged_mw.view.posed_robot import Placement, PosedRobots, RoughGround
 
 AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
 ELEVATION_ALL = -35.0  # [deg]
-DISTANCE = 2.4  # [robot radius] camera to base, at least
-BEHIND = 1.3 * DISTANCE  # likewise from behind
-ARROWS = 0.45  # [robot radius] above its top: the picture has room for the arrows there
-ROOM = 0.88  # share of the picture's height that robot and arrows take, at most
-# share of the way to the base per frame; slower in z, so that steps do not shake the picture
+DISTANCE = 2.4  # [robot radius] least distance from camera to base
+BEHIND = 1.3 * DISTANCE  # the same for the camera behind the robot
+ARROWS = 0.45  # [robot radius] room for the arrows above the robot's top
+ROOM = 0.88  # largest share of the picture's height for robot and arrows
+# Filter: share of the distance to the base per frame. z is slower, so that steps do not shake the picture.
 FOLLOW_XY, FOLLOW_Z = 0.12, 0.04
-FOLLOW_ALL = 0.04  # the same for all: slow, because robots come into reach and leave it
-REACH = 14.0  # [robot radius] from the followed robot; "all" shows the robots within it
-REACH_HILLS = 24.0  # the same on hills, where each begins on a tile of its own
-TURN = 0.08  # share of the way to the heading per frame
-# [deg], [robot radius]: on hills it sees the feet, so far below the base, over a rise
+FOLLOW_ALL = 0.04  # the same in mode "all": slow, because robots enter and leave the reach
+REACH = 14.0  # [robot radius] mode "all" shows the robots within this distance of the followed one
+REACH_HILLS = 24.0  # the same on hills, where each robot starts on a separate tile
+TURN = 0.08  # filter: share of the angle to the heading per frame
+# On hills the feet must be visible over a rise: steepest elevation [deg],
+# clearance of the line of sight and depth of the feet below the base [robot radius].
 STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6
-LIFT = 0.06  # share of the way to the elevation that this needs per frame
-JUMP = 3.0  # [robot radius] a base that moved this far at once was reset: the camera cuts to it
+LIFT = 0.06  # filter: share of the angle to this elevation per frame
+JUMP = 3.0  # [robot radius] a larger move of the base in one frame is a reset, and the camera jumps too
 
 
 def distance(placement: Placement, fovy: float, least: float = DISTANCE) -> float:
-    """Camera to base [m], so that all of the robot and its arrows are in the picture; ``fovy`` [deg] is the picture's height.
+    """Distance from camera to base [m] at which robot and arrows fit into the picture.
 
-    ``least`` [robot radius] is the distance to a robot that is not tall.
+    ``fovy`` [deg]: vertical field of view. ``least`` [robot radius]: distance to a robot that is not tall.
     """
     slope, down = ROOM * math.tan(math.radians(fovy) / 2), math.radians(-ELEVATION)
-    # seen from above, what is above the base is nearer and what is below it farther away
+    # seen from above, points above the base are nearer than the base and points below it are farther away
     above = (placement.top + ARROWS * placement.radius) * (math.cos(down) / slope + math.sin(down))
     below = placement.bottom * (math.cos(down) / slope - math.sin(down))
     return max(least * placement.radius, above, below)
 
 
 class RobotCamera:
-    """Moves `camera`. Where a mouse can turn it (`by_hand`), it is placed once and then tracks the robot by itself."""
+    """Moves `camera`. If a mouse can turn it (`by_hand`), it is placed once and then MuJoCo tracks the robot."""
 
     def __init__(self, camera: mujoco.MjvCamera, robots: PosedRobots, by_hand: bool) -> None:
         self.camera, self.robots, self.by_hand = camera, robots, by_hand
@@ -52,7 +53,7 @@ class RobotCamera:
         self._fovy = float(robots.model.vis.global_.fovy)
 
     def update(self, mode: str, world: int, frames: float = 1.0) -> mujoco.MjvCamera:
-        """Move as `mode` says, one of drive.CAMERAS. `frames` of a video passed since the last call."""
+        """Move the camera in `mode`, one of drive.CAMERAS. `frames`: video frames since the last call."""
         self._frames = frames
         before, self._target = self._target, (mode, world)
         changed = before is None or before[0] != mode
@@ -79,7 +80,7 @@ class RobotCamera:
         return self.camera
 
     def _place(self, world: int) -> None:
-        """Look at the robot from its front right."""
+        """Place the camera at the front right of the robot."""
         placement, camera = self.robots.placements[world], self.camera
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] = placement.position
@@ -88,7 +89,7 @@ class RobotCamera:
         camera.elevation = ELEVATION
 
     def _follow(self, world: int, cut: bool) -> None:
-        """Move one frame's share of the way to the robot; all of it after a jump."""
+        """Move by one frame's share of the distance to the robot. `cut`: move by all of it."""
         camera, placement = self.camera, self.robots.placements[world]
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         gap = placement.position - camera.lookat
@@ -101,7 +102,7 @@ class RobotCamera:
             camera.elevation += gap if cut else gap * self._share(LIFT)
 
     def _free_elevation(self, ground: RoughGround, radius: float) -> float:
-        """Elevation [deg] from which the ground between camera and robot hides nothing."""
+        """The elevation [deg] at which no ground between camera and robot hides the feet."""
         camera = self.camera
         away = camera.distance * math.cos(math.radians(ELEVATION)) * np.linspace(0.3, 1.0, 8)
         azimuth = math.radians(camera.azimuth)
@@ -114,7 +115,7 @@ class RobotCamera:
         return max(min(ELEVATION, -math.degrees(float(np.arctan2(rise, away).max()))), STEEPEST)
 
     def _share(self, each: float) -> float:
-        """Share of the way after `self._frames` steps of `each`."""
+        """The share of the distance after `self._frames` filter steps of `each`."""
         return 1.0 - (1.0 - each) ** self._frames
 
     def _turn(self, azimuth: float, cut: bool) -> None:
@@ -125,7 +126,7 @@ class RobotCamera:
             camera.distance, camera.elevation = distance(self.robots.placements[0], self._fovy, BEHIND), ELEVATION
 
     def _see_all(self, world: int, cut: bool) -> None:
-        """Show all robots within reach of this one: robots walk apart, and from too far they are specks."""
+        """Show all robots within reach of this one. Robots walk apart, and a view of all would make them too small."""
         places = np.array([placement.position for placement in self.robots.placements])
         limit = REACH if self.robots.ground is None else REACH_HILLS
         near = places[np.linalg.norm(places - places[world], axis=1) < limit * self.robots.radius]

@@ -1,7 +1,7 @@
-"""Driving: the command, held to the trained ranges, and everything else that a user can ask for while watching.
+"""User input while watching: the command, clipped to its trained range, and all other actions.
 
-Only the table `BINDINGS` names keys; the window, the web page and the table in the documentation follow it.
-Nothing here draws, steps or waits: a session asks the pilot what is wanted.
+Keys are defined only in the table `BINDINGS`, which the window, the web page and the documentation read.
+Nothing here draws, steps or waits. The session reads the pilot once per turn.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from legged_mw.utils.commands import LABELS, VELOCITY, Command
 from legged_mw.view.stage import FloatArray
 
 CAMERAS = ("follow", "behind", "all")
-STEPS = 5  # ours: presses of a key from the default of a command to the farther end of its range
+STEPS = 5  # ours: key presses from a command's default to the farther end of its range
 SPEEDS = (1.0, 0.5, 0.25, 0.1)  # shares of real time
-PUSH_SPEED = 1.0  # [m/s] ours: seen well, and survived by any policy that walks (the exam asks for 2)
+PUSH_SPEED = 1.0  # [m/s] ours: clearly visible, and any walking policy survives it (the exam's mark is 2)
 PUSH_MAX = 4.0  # [m/s]
 NO_COMMANDS = "this task has no commands: its robots cannot be driven"
 
@@ -33,7 +33,7 @@ class Binding(NamedTuple):
     text: str
 
 
-# MuJoCo's window gets the same presses; what they switch there is switched back (native.py).
+# MuJoCo's window receives the same key presses. native.py reverts the options that they toggle there.
 BINDINGS = (
     Binding("forward", ("up",), "faster ahead"),
     Binding("back", ("down",), "slower, then backwards"),
@@ -58,7 +58,7 @@ BINDINGS = (
 ACTIONS = tuple(binding.action for binding in BINDINGS)
 KEY_ACTION = {key: binding.action for binding in BINDINGS for key in binding.keys}
 _VX, _VY, _YAW_RATE = VELOCITY
-_FURTHER = ""  # in place of a name: the first command that is none of these
+_FURTHER = ""  # stands for the first command that is not in this table
 _STEP = {  # command, sign
     "forward": (_VX, 1),
     "back": (_VX, -1),
@@ -72,25 +72,25 @@ _STEP = {  # command, sign
 
 
 class Pilot:
-    """What the user wants now. `ask`, `press`, `steer` and `push` may be called from any thread; the rest belongs to the session's."""
+    """The user's input. `ask`, `press`, `steer`, `push` are thread-safe; only the session's thread may use the rest."""
 
     def __init__(
         self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}
     ) -> None:
-        """``only``: the actions that there are, with other words for them or ""; empty: all. Without "own" nothing is driven."""
+        """``only``: available action -> new description or ""; empty: all. Without "own" there is no driving."""
         self.table, self.num_worlds = tuple(table), num_worlds
         self.low, self.high, self.default = (
             np.array([getattr(command, end) for command in table], dtype=np.float64)
             for end in ("low", "high", "default")
         )
         self.command = self.default.copy()
-        self.driving = False  # else the stage follows its own commands
-        self.everyone = False  # drive all robots, else only `world`
+        self.driving = False  # False: the stage follows its own commands
+        self.everyone = False  # drive all robots; False: only `world`
         self.world, self.camera = 0, camera
         self.paused, self.help = False, False
         self.speed = SPEEDS[0]
         self.push_speed = PUSH_SPEED
-        self.message = ""  # why the last action did nothing
+        self.message = ""  # the reason why the last action had no effect
         self.bindings = tuple(
             b._replace(text=only.get(b.action) or b.text) for b in BINDINGS if not only or b.action in only
         )
@@ -101,36 +101,36 @@ class Pilot:
         self._random = np.random.default_rng(0)
 
     def ask(self, action: str) -> None:
-        """Do one of ACTIONS at the session's next turn."""
+        """Request one of ACTIONS for the session's next turn."""
         if action not in ACTIONS:
             raise ValueError(f"no action '{action}'; there are: {', '.join(ACTIONS)}")
         if action in self.can:
             self._asked.put(lambda: self._do(action))
 
     def press(self, key: str) -> None:
-        """Do what a key of the table asks for; other keys do nothing."""
+        """Request the action of a key in the table. Other keys do nothing."""
         if key in KEY_ACTION:
             self.ask(KEY_ACTION[key])
 
     def steer(self, command: ArrayLike) -> None:
-        """Drive by `command` (C,), held to its ranges, from the session's next turn on."""
+        """Drive by `command` (C,), clipped to its ranges, from the session's next turn on."""
         wanted = np.array(command, dtype=np.float64)
         self._asked.put(lambda: self._steer(wanted))
 
     def push(self, velocity: ArrayLike | None = None) -> None:
-        """Push the driven robots by (2,) [m/s], world frame; None: at `push_speed` in a random direction."""
+        """Push the driven robots by `velocity` (2,) [m/s], world frame. None: `push_speed` in a random direction."""
         added = None if velocity is None else np.array(velocity, dtype=np.float64)
         self._asked.put(lambda: self._push(added))
 
     # ---- the session's side
 
     def follow(self, command: ArrayLike) -> None:
-        """Keep the robot's own command (C,) while nobody drives: driving begins from there."""
+        """Copy the robot's own command (C,) while the user does not drive. Driving starts from this command."""
         if not self.driving:
             self.command = self._held(command)
 
     def listen(self) -> None:
-        """Do all that was asked since the last turn."""
+        """Do all actions that were requested since the last turn."""
         while True:
             try:
                 self._asked.get_nowait()()
@@ -138,7 +138,7 @@ class Pilot:
                 return
 
     def commands(self, own: FloatArray) -> FloatArray | None:
-        """The commands to step with, given those of the stage (N, C); None: the stage's own."""
+        """The commands (N, C) of the next step, given those of the stage. None: the stage's own."""
         if not self.driving:
             return None
         wanted = np.array(own, dtype=np.float64)
@@ -146,16 +146,16 @@ class Pilot:
         return wanted
 
     def driven(self) -> list[int]:
-        """The worlds that are driven, pushed and reset."""
+        """The worlds that the user drives, pushes and resets."""
         return list(range(self.num_worlds)) if self.everyone else [self.world]
 
     def take_pushes(self) -> list[tuple[int, FloatArray]]:
-        """(world, velocity (2,) [m/s]) of each push since the last call."""
+        """The pushes since the last call, each (world, velocity (2,) [m/s])."""
         pushes, self._pushes = self._pushes, []
         return pushes
 
     def take_resets(self) -> list[int]:
-        """Worlds to reset, each once."""
+        """The worlds to reset, without duplicates."""
         resets, self._resets = self._resets, set()
         return sorted(resets)
 
@@ -189,7 +189,7 @@ class Pilot:
                 self._step(*_STEP[action])
 
     def _step(self, name: str, sign: int) -> None:
-        """One press of a key: a fifth of the way from the default to the farther end of the range."""
+        """Change a command by one key press: a fifth of the span from the default to the farther end of its range."""
         columns = [i for i, each in enumerate(self.table) if (each.name == name if name else each.name not in VELOCITY)]
         if self.table and not columns:
             self.message = (
@@ -199,7 +199,7 @@ class Pilot:
         command = self.command.copy()
         for i in columns[:1]:
             command[i] += sign * max(self.high[i] - self.default[i], self.default[i] - self.low[i]) / STEPS
-        # five steps up and five down end exactly at the default
+        # round, so that five steps up and five steps down end exactly at the default
         self._steer(np.where(np.abs(command - self.default) < 1e-9, self.default, command))
 
     def _push(self, velocity: FloatArray | None) -> None:

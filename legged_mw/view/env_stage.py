@@ -1,4 +1,4 @@
-"""The training environment and a policy as a stage. The only file of `view/` that uses torch and the environment."""
+"""The training environment with a policy as a stage. Only this file of `view/` imports torch and the environment."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ from legged_mw.view.stage import BoolArray, FloatArray
 
 
 class EnvStage:
-    """Robots of a task under `policy`; see `stage.Stage`. `command_table` has the ranges as trained, by default the task's own.
+    """The robots of a task under `policy`; see `stage.Stage`.
+
+    `command_table`: the commands with their trained ranges; by default those of the task.
 
     The environment's step may be a recorded graph, so a pilot's changes are written into its buffers between two steps.
-    The policy sees a command in the same step: the observations' rows "commands" and "gait_clock" are written again. Those
-    only, because noise and delays of the others belong to the step. ``newest`` renews the policy as it trains.
+    The policy must see a new command in the same step, so the observation rows "commands" and "gait_clock" are updated.
+    Other rows keep the noise and the delays of the last step. ``newest`` reloads a policy that is being trained.
     """
 
     def __init__(
@@ -41,7 +43,7 @@ class EnvStage:
         self.env, self.policy, self._newest = env, policy, newest
         self.spec, self.num_worlds, self.dt = visual_spec(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
         self.command_table = env.command_table if command_table is None else tuple(command_table)
-        # a task with a table has a buffer for it, (N, C)
+        # (N, C), the environment's buffer; a task without commands has none
         self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
         self._gait = env.gait if isinstance(env, LeggedRobot) else None
         self._command_columns, self._clock_columns = _columns_of(env, "commands"), _columns_of(env, "gait_clock")
@@ -50,8 +52,8 @@ class EnvStage:
         )
         self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
-        self._believed: Tensor | None = None  # vx, vy (N, 2) when it acted last
-        self._overflowed = False  # and was said
+        self._believed: Tensor | None = None  # estimated vx, vy (N, 2) at the last action
+        self._overflowed = False  # and the user has been warned
 
     @torch.no_grad()
     def step(self, commands: FloatArray | None) -> None:
@@ -74,7 +76,7 @@ class EnvStage:
 
     @property
     def news(self) -> str:
-        """Which policy it is, where that changes."""
+        """The loaded policy as text, for a stage that reloads it; else empty."""
         return self._newest.news if self._newest else ""
 
     def commands(self) -> FloatArray:
@@ -119,7 +121,7 @@ class EnvStage:
 
 
 def _columns_of(env: RobotTask, wanted: str) -> list[tuple[str, slice, Tensor]]:
-    """Where the observations hold the newest of a row, also inside of a group in a group: (group, columns, scales)."""
+    """The places of a row's newest values in the observations, also in nested groups: (group, columns, scales)."""
     found: list[tuple[str, slice, Tensor]] = []
     for group, rows in env.observations.groups.items():
         for row in rows:

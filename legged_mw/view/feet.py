@@ -1,4 +1,4 @@
-"""Where feet touch the ground: the patch of each, whatever it is made of. numpy and a posed model; nothing is drawn here."""
+"""The contact patch of each foot, for any shape of its geoms. Needs numpy and a posed model; draws nothing."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -14,23 +14,23 @@ import numpy as np
 
 from legged_mw.view.stage import FloatArray
 
-# [smallest half extent of the foot's geoms] by which a patch is larger than what touches: a ball touches in a point
+# [smallest half extent of the foot's geoms] margin around the contact points: a sphere touches at a single point
 MARGIN = 2.2
 MARGIN_MIN, MARGIN_MAX = 0.045, 0.15  # [robot radius]
-FLAT = 0.5  # [margin] above its lowest point a foot still touches: a sole that is tilted a little is flat
+FLAT = 0.5  # [margin] points up to this height above the lowest one count as contact: a slightly tilted sole is flat
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
 class Patch(NamedTuple):
     """An upright ellipse on the ground."""
 
-    place: FloatArray  # (3,) of its middle, at the foot's lowest height [m]
-    turn: FloatArray  # (3, 3) from its axes to the world's: x is the foot's, on the ground, z is up
-    half: FloatArray  # (2,) half its length and its width [m]
+    place: FloatArray  # (3,) [m] its centre, at the height of the foot's lowest point
+    turn: FloatArray  # (3, 3) rotation to the world frame: x is the foot's x axis on the ground, z is up
+    half: FloatArray  # (2,) [m] half length, half width
 
 
 def feet_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[list[int]]:
-    """Places in ``geoms`` of the geoms of each foot: those of one body are one foot."""
+    """For each foot, the indices of its geoms in ``geoms``. The geoms of one body are one foot."""
     feet: dict[int, list[int]] = {}
     for place, geom in enumerate(geoms):
         feet.setdefault(int(model.geom_bodyid[geom]), []).append(place)
@@ -38,7 +38,7 @@ def feet_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[list[int]]:
 
 
 def patch(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int], radius: float) -> Patch:
-    """The patch below those ``geoms`` of one foot that touch the ground; ``radius`` [m] is the robot's size."""
+    """The patch of one foot; ``geoms`` are its geoms in contact, ``radius`` [m] is the robot's size."""
     points = np.concatenate([lowest_points(model, data, geom) for geom in geoms])
     thin = min(float(model.geom_aabb[geom, 3:].min()) for geom in geoms)
     margin = min(max(MARGIN * thin, MARGIN_MIN * radius), MARGIN_MAX * radius)
@@ -55,7 +55,7 @@ def patch(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int], radi
 
 
 def lowest_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> FloatArray:
-    """Points (P, 3) [m] with the lowest one among them: of a box, and of what is as good as one, its corners."""
+    """Points (P, 3) [m] of a geom that include its lowest one: corners, for a box and other kinds of geom."""
     centre, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
     kind, down = model.geom_type[geom], np.array([0.0, 0.0, -1.0])
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:

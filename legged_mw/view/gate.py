@@ -1,6 +1,6 @@
-"""Who may reach the web page: a browser that opened it by its own address, with its token where it has one.
+"""Access control of the web page: a browser must open the page's own address, with its token if the page has one.
 
-Headers in, a refusal out. Nothing here knows MuJoCo.
+Takes request headers, returns a refusal. Independent of MuJoCo.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 LOCAL = "127.0.0.1"
-SOCKETS = ("/ui", "/state")  # paths of Studio's WebSockets that a page needs
+SOCKETS = ("/ui", "/state")  # paths of the page's WebSockets in Studio
 FRAMES = ("iframe", "frame", "embed", "object", "fencedframe")
-MOST = 1 << 20  # [bytes] of one message from a browser; ours: input of a second is a hundredth of it
-PATIENCE = 10.0  # [s] for a browser to say what it wants
-HEADERS = {  # of every answer: no other page may show this one or read from it
+MOST = 1 << 20  # [bytes] largest message from a browser; ours: 100 times the input of one second
+PATIENCE = 10.0  # [s] time limit for a browser's request
+HEADERS = {  # of every response: no other page may embed this one or read from it
     "X-Frame-Options": "DENY",
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -31,7 +31,7 @@ HEADERS = {  # of every answer: no other page may show this one or read from it
 
 
 def is_local(host: str) -> bool:
-    """Whether only this machine reaches ``host``."""
+    """Whether ``host`` is reachable from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -39,7 +39,7 @@ def is_local(host: str) -> bool:
 
 
 class Gate:
-    """Of one page. A page that others than this machine reach has a token."""
+    """The access control of one page. A page that other machines can reach has a token."""
 
     def __init__(self, host: str, port: int) -> None:
         self.port, self.token = port, "" if is_local(host) else secrets.token_urlsafe(16)
@@ -47,7 +47,7 @@ class Gate:
         self._cookie = f"legged_mw_{port}"
 
     def url(self, host: str) -> str:
-        """What the user opens. Of all interfaces (0.0.0.0, ::) it names this machine."""
+        """The address for the user's browser. For all interfaces (0.0.0.0, ::) it names this machine."""
         name = (
             "localhost"
             if host == LOCAL
@@ -60,10 +60,10 @@ class Gate:
         return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
     def refusal(self, target: str, header: Callable[[str], list[str]]) -> str:
-        """Why a request for ``target`` (path and query) is not answered; empty if it is. ``header`` gives all values of a name.
+        """The reason to refuse a request for ``target`` (path and query); empty to accept it.
 
-        A name that was rebound to this machine's address (DNS rebinding) shows in Host, a page of another site in Origin or
-        Sec-Fetch-Site. A browser sets these three itself; no page can.
+        ``header``: name -> all values. DNS rebinding shows in Host; a page of another site in Origin or Sec-Fetch-Site.
+        The browser sets these three headers, and no page can change them.
         """
         host, origin, path = header("Host"), header("Origin"), target.partition("?")[0]
         if len(host) != 1 or not self._known(host[0]):
@@ -86,12 +86,12 @@ class Gate:
         return ""
 
     def asked(self, target: str) -> str:
-        """The token in a query."""
+        """The token in the query of ``target``."""
         found = re.search(r"[?&]token=([\w-]*)", target)
         return found[1] if found else ""
 
     def greeting(self, target: str) -> dict[str, str]:
-        """Headers that answer a first visit with its right token: keep the token, and leave it out of the address. Else empty."""
+        """Headers for a first visit with the right token: set a cookie, drop the token from the address. Else empty."""
         if not self.token or target.partition("?")[0] != "/" or not self._shown(self.asked(target)):
             return {}
         return {"Location": "/", "Set-Cookie": f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"}
@@ -104,7 +104,7 @@ class Gate:
         return [value for name, _, value in pairs if name == self._cookie]
 
     def _known(self, host: str) -> bool:
-        """Whether a Host is ours: a name that we have, or an address in numbers, which no name server can rebind."""
+        """Whether a Host header is ours: a known name, or a numeric address, which DNS cannot rebind."""
         match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d{1,5})?", host)
         if not match:
             return False
@@ -116,7 +116,7 @@ class Gate:
 
 
 class OwnSocket(socket.socket):
-    """Listens on this machine for this process alone, where the system says whose a connection is (Linux); else for this machine."""
+    """A listening socket that accepts only this process on Linux, and only this machine on other systems."""
 
     def __init__(self, port: int = 0) -> None:
         super().__init__(socket.AF_INET, socket.SOCK_STREAM)
@@ -124,7 +124,7 @@ class OwnSocket(socket.socket):
         self.listen()
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Raises BlockingIOError, as if nobody had come, for somebody else."""
+        """Accept a connection. Raises BlockingIOError, as without a connection, for another process."""
         connection, peer = super().accept()
         if not is_own(peer[1], self.getsockname()[1]):
             connection.close()

@@ -1,4 +1,4 @@
-"""From flags to a running session: the viewer, the driver, the time. Used by every program that shows a stage."""
+"""From flags to a running session: the viewer, the pilot, the duration. Used by every program that shows a stage."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
 from legged_mw.view.video import check_format, no_encoder
 
 VIEWERS = ("auto", "native", "web", "video", "none")
-ROBOTS_SHOWN = 64  # at most: a picture of more takes longer than a control step
-SECONDS = 10.0  # ours: how long to record, or to run without a viewer
+ROBOTS_SHOWN = 64  # at most: drawing more takes longer than a control step
+SECONDS = 10.0  # ours: duration of a recording, or of a run without a viewer
 
 
 class FlagError(UserError, ValueError):
-    """Flags that do not go together, or a wrong value."""
+    """Flags that exclude each other, or an invalid value."""
 
 
 def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
-    """Add the flags of watching and driving; the program adds `--command` and `--time` [s] itself."""
+    """Add the flags of watching and driving. The program adds `--command` and `--time` [s] itself."""
     best = " (auto: the best that this machine has)"
     parser.add_argument(
         "--viewer", choices=VIEWERS, default=viewer, help=f"where to show it, by default {viewer}{best}"
@@ -54,7 +54,7 @@ def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse wrong flags before anything is loaded. Raises FlagError or ViewError."""
+    """Refuse invalid flags before anything is loaded. Raises FlagError or ViewError."""
     files = [flag for flag in ("video", "sheet") if getattr(args, flag) is not None]
     if files and args.viewer not in ("auto", "video"):
         raise FlagError(f"--{files[0]} records and --viewer {args.viewer} does not: leave one of them out")
@@ -69,9 +69,9 @@ def check_flags(args: argparse.Namespace) -> None:
 
 
 def check_drive(args: argparse.Namespace, table: Sequence[Command], advice: str = "") -> list[float] | None:
-    """Check `--commands` and `--command` against the commands as trained; the latter as values (C,), None if not given.
+    """Check `--commands` and `--command` against the trained ranges. Return the values (C,) of `--command`, or None.
 
-    `advice` is for a value outside of its range (empty: widen the range). Raises ConfigError or FlagError.
+    `advice`: hint for a value outside its range (empty: widen the range). Raises ConfigError or FlagError.
     """
     if args.commands:
         load_script(args.commands, table)
@@ -86,21 +86,21 @@ def check_drive(args: argparse.Namespace, table: Sequence[Command], advice: str 
 
 
 def _widen(values: Sequence[float], table: Sequence[Command]) -> str:
-    """How to see what a policy does outside of the ranges that it was trained in."""
+    """The hint to widen a range, for a command outside the trained ranges."""
     value, command = next(pair for pair in zip(values, table, strict=True) if outside(pair[:1], pair[1:]))
     low, high = min(command.low, value), max(command.high, value)
     return f"to see what it does there, widen the range: --set commands.ranges.{command.name}=[{low:g},{high:g}]"
 
 
 def asked(args: argparse.Namespace) -> list[str]:
-    """The flags of ``add_flags`` that were given."""
+    """The flags of ``add_flags`` that the user set."""
     default = {"viewer": "auto", "camera": "follow", "host": web.LOCAL, "port": 0}
     names = ("viewer", "video", "sheet", "commands", "camera", "host", "port")
     return [f"--{name}" for name in names if getattr(args, name) != default.get(name)]
 
 
 def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str, str]:
-    """The viewer to take, and why. Somebody at a terminal can open a web page; a batch job must end by itself."""
+    """The viewer and the reason for it. A user at a terminal can open a web page; a batch job must end by itself."""
     if args.viewer != "auto":
         return args.viewer, "as asked"
     if args.video or args.sheet:
@@ -115,9 +115,9 @@ def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str,
 
 
 def watch(stage: Stage, args: argparse.Namespace, folder: Path, title: str = "legged_mw", **picture: Any) -> Outcome:
-    """Show `stage` as the flags say, a video of the size and rate `picture` (see Recorder); files without a name go to `folder`.
+    """Show `stage` in the viewer of the flags. Files without a given name go to `folder`.
 
-    Prints its choice, where to look, and the outcome.
+    `picture`: size and rate of a video, see Recorder. Prints the chosen viewer, its address or file, and the outcome.
     """
     script = load_script(args.commands, stage.command_table) if args.commands else None
     kind, why = choose(args, sys.stdout.isatty(), has_display())
@@ -147,7 +147,7 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, title: str = "le
 
 
 def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
-    """A pilot of the robots that are shown; scripts drive all of them."""
+    """The pilot of the shown robots. A script drives all of them."""
     count = min(stage.num_worlds, ROBOTS_SHOWN)
     if count < stage.num_worlds and kind != "none":
         print(f"{stage.num_worlds} robots, the first {count} of them are shown")
@@ -157,7 +157,7 @@ def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
 
 
 def window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
-    """MuJoCo's window; None, with a printed reason, where it cannot be opened and another viewer may be taken."""
+    """MuJoCo's window. If it cannot open and `fall_back` is set: print the reason and return None."""
     try:
         viewer = NativeViewer(stage.spec, pilot, pilot.num_worlds)
     except ViewError as error:
@@ -170,7 +170,7 @@ def window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | No
 
 
 def web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, title: str) -> Viewer:
-    """The page, and where to look."""
+    """Open the web page and print its address."""
     page = web.WebViewer(stage.spec, pilot, pilot.num_worlds, host=args.host, port=args.port, title=title)
     print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
     if args.host == web.LOCAL and not has_display():
@@ -191,7 +191,7 @@ def _recorder(
     video, sheet = (Path(name) if name else None for name in (args.video, args.sheet))
     if video is None and sheet is None:
         video, sheet = folder / "play.mp4", folder / "play.png"
-        if (reason := no_encoder()) is not None:  # no video was asked for by name
+        if (reason := no_encoder()) is not None:  # the user did not name a video
             print(f"no video: {reason}")
             video = None
     print(
@@ -202,7 +202,7 @@ def _recorder(
 
 
 class NoViewer:
-    """The viewer that shows nothing."""
+    """A viewer that shows nothing."""
 
     def show(self, moment: Moment) -> None: ...
 

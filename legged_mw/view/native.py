@@ -1,4 +1,4 @@
-"""MuJoCo's own window: shows moments and hands keys to the pilot. MuJoCo runs it on a thread of its own."""
+"""MuJoCo's window: shows moments and passes keys to the pilot. MuJoCo runs it on a separate thread."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -20,9 +20,9 @@ from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment, ViewError
 
 CLOSE_SECONDS = 5.0
-TEXT_SECONDS = 0.1  # between two changes of text
+TEXT_SECONDS = 0.1  # least time between two changes of text
 _GLFW = {"right": 262, "left": 263, "down": 264, "up": 265, "space": 32, "backspace": 259, "enter": 257}
-# GLFW's code of a letter is its capital's ASCII
+# GLFW's code of a letter is the ASCII code of its capital
 KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}
 
 
@@ -32,8 +32,8 @@ Text = tuple[int | None, int | None, str, str]  # font, place, left column, righ
 class NativeViewer:
     """A window. The camera follows the chosen robot; the mouse turns it. Keys go to the pilot.
 
-    MuJoCo's own shortcuts get the same presses and switch what is drawn (P: contact points, R: reflections ...). What
-    our keys switch is switched back before the next picture. All its other keys work as in any MuJoCo window.
+    MuJoCo's shortcuts receive the same key presses and toggle drawing options (P: contact points, R: reflections ...).
+    The options toggled by our keys are reverted before the next picture. All other keys work as in any MuJoCo window.
     """
 
     def __init__(self, spec: mujoco.MjSpec, pilot: Pilot | None = None, count: int = 1) -> None:
@@ -41,9 +41,10 @@ class NativeViewer:
         before = set(threading.enumerate())
         self._handle: Any = _launch(self.robots.model, self.robots.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
-        self._texts: list[Text] = []  # replaced, never changed: another thread reads it
+        self._texts: list[Text] = []  # replaced, never modified: another thread reads it
         self._ended = threading.Event()
-        self._writer = threading.Thread(target=self._write, daemon=True)  # a closed window may never answer
+        # a daemon, because a closed window may block it forever
+        self._writer = threading.Thread(target=self._write, daemon=True)
         with self._handle.lock():
             show_groups(self._handle.opt)
             self._camera = RobotCamera(self._handle.cam, self.robots, by_hand=True)
@@ -54,11 +55,11 @@ class NativeViewer:
         self._writer.start()
 
     def show(self, moment: Moment) -> None:
-        """Show one moment. Does nothing once the window is closed."""
+        """Show one moment. Does nothing after the window is closed."""
         if not self.is_running():
             return
         handle = self._handle
-        with handle.lock():  # the window's thread draws from all of these
+        with handle.lock():  # the window's thread reads all of these to draw
             self.robots.pose(moment.qpos, moment.world)
             handle.user_scn.ngeom = 0
             draw(handle.user_scn, self.robots, moment)
@@ -69,19 +70,19 @@ class NativeViewer:
         handle.sync()
 
     def is_running(self) -> bool:
-        """False once the window is closed."""
+        """Whether the window is open."""
         return bool(self._handle.is_running())
 
     def close(self) -> None:
-        """Close the window and wait until it is gone; again is allowed."""
+        """Close the window and wait until it has closed. May be called twice."""
         self._ended.set()
         self._writer.join(timeout=CLOSE_SECONDS)
         self._handle.close()
-        for thread in self._threads:  # a process that ends while the window still closes crashes in its OpenGL driver
+        for thread in self._threads:  # the OpenGL driver crashes if the process ends before the window has closed
             thread.join(timeout=CLOSE_SECONDS)
 
     def _write(self) -> None:
-        """Set the window's texts, on a thread of its own: a change waits for a redraw, twice a second with software OpenGL."""
+        """Set the window's texts on a separate thread: each change waits for a redraw, 0.5 s with software OpenGL."""
         written: list[Text] = []
         while not self._ended.wait(TEXT_SECONDS) and self._handle.is_running():
             texts = self._texts
@@ -91,12 +92,12 @@ class NativeViewer:
 
 
 def on_key(pilot: Pilot) -> Callable[[int], None]:
-    """The callback for key presses: MuJoCo's window calls it with a GLFW key code, on its own thread."""
+    """The callback for key presses. MuJoCo's window calls it with a GLFW key code on the window's thread."""
     return lambda code: pilot.press(KEY_CODES.get(code, ""))
 
 
 def window_texts(moment: Moment, bindings: Sequence[Binding] = BINDINGS) -> list[Text]:
-    """The blocks of text for MuJoCo's window."""
+    """The text blocks for MuJoCo's window."""
     grid = mujoco.mjtGridPos
     blocks: list[Text] = []
     if moment.lines:
@@ -117,7 +118,7 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
         )
     if sys.platform.startswith("linux"):
         _probe_window()
-    import mujoco.viewer  # here, because it loads GLFW, which a server may lack
+    import mujoco.viewer  # imported here because it loads GLFW, which a server may lack
 
     try:
         return mujoco.viewer.launch_passive(model, data, key_callback=on_key, show_left_ui=False, show_right_ui=False)
@@ -130,9 +131,9 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
 
 
 def _probe_window() -> None:
-    """Open and drop a hidden window: where that fails, `launch_passive` would wait for its dead thread forever."""
+    """Open and close a hidden window as a test. If that fails, `launch_passive` would wait forever."""
     opened: list[bool] = []
-    # on a thread of its own: GLX may not become current where an offscreen renderer holds an EGL context
+    # on a separate thread: GLX cannot become current on a thread where an offscreen renderer holds an EGL context
     thread = threading.Thread(target=lambda: opened.append(_can_open_window()))
     thread.start()
     thread.join()

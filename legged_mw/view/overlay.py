@@ -1,6 +1,6 @@
-"""Geoms of a picture beside the robots: velocity arrows, feet on the ground, places of falls, what is followed.
+"""Extra geoms of a picture: velocity arrows, foot contacts, places of falls, and the reference motion as ghosts.
 
-Appends to a `mujoco.MjvScene`; opens no window, no file and no OpenGL context.
+Appends to a `mujoco.MjvScene`. Opens no window, no file and no OpenGL context.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -17,27 +17,27 @@ from legged_mw.view.feet import Patch
 from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.stage import FloatArray, Moment
 
-# ours: vermillion, sky blue, bluish green and reddish purple of Okabe and Ito's palette, which the colour-blind tell apart
+# ours: vermillion, sky blue, bluish green and reddish purple of Okabe and Ito's palette, safe for the colour-blind
 COMMAND_RGBA = (0.90, 0.38, 0.00, 1.0)
 VELOCITY_RGBA = (0.20, 0.62, 0.95, 1.0)
 CONTACT_RGBA = (0.00, 0.75, 0.52, 0.9)
 FALL_RGBA = (0.90, 0.20, 0.45, 0.45)
 GHOST_RGBA = (0.55, 0.75, 0.95, 0.3)  # ours: pale blue
 
-# [robot radius per m/s] arrow length; MuJoCo draws half of it: at 1 m/s a little more than from base to nose
+# [robot radius per m/s] arrow length. MuJoCo draws half of it: at 1 m/s a little more than from base to nose.
 ARROW_PER_SPEED = 1.3
-ARROW_MAX = 1.95  # [robot radius] of the fastest command: a longer arrow would leave the picture
-LEVELS = (0.36, 0.24)  # [robot radius] above its top: the commanded velocity, the measured one
-ARC_PER_RATE = 1.0  # [rad per rad/s] the turn arrow shows one second of turning, at most ARC_MAX of it
+ARROW_MAX = 1.95  # [robot radius] length for the fastest command; a longer arrow would leave the picture
+LEVELS = (0.36, 0.24)  # [robot radius] height above the robot's top of commanded and measured velocity
+ARC_PER_RATE = 1.0  # [rad per rad/s] the arc shows the turn of one second, at most ARC_MAX
 ARC_MAX = 1.75 * math.pi  # [rad]
 ARC_SEGMENTS = 12
-DISC = 0.006  # [robot radius] half the thickness of a disc below a foot
-SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] below these an arrow is a speck that flickers
-ROBOTS_WITH_ARROWS = 32  # more of them hide the robots
+DISC = 0.006  # [robot radius] half thickness of a disc below a foot
+SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] smaller velocities get no arrow: it would flicker
+ROBOTS_WITH_ARROWS = 32  # at most: more arrows would hide the robots
 
 
 def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
-    """Append all of `moment` to `scene`, which shows the robots already."""
+    """Append all geoms of `moment` to `scene`, which already has the robots."""
     for world in range(min(robots.count, ROBOTS_WITH_ARROWS)):
         target, velocity, turn = moment.target_velocity[world], moment.velocity[world], world == moment.world
         draw_velocities(scene, robots.placements[world], target, velocity, turn, moment.top_speed)
@@ -57,9 +57,9 @@ def draw_velocities(
     turn: bool = True,
     top_speed: float = 1.0,
 ) -> None:
-    """Append arrows for the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the robot's top.
+    """Append arrows above the robot for the commanded and the measured velocity, (vx, vy, yaw rate) in the body frame.
 
-    A component whose target is NaN has no arrows. `turn`: the yaw rate too. `top_speed` [m/s] has the longest arrow.
+    A component with target NaN gets no arrow. `turn`: draw the yaw rate too. `top_speed` [m/s]: gets the longest arrow.
     """
     target, velocity = np.asarray(target, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
     for array in (target, velocity):
@@ -81,11 +81,11 @@ def _draw_straight(
     per_speed: float,
     rgba: tuple[float, ...],
 ) -> None:
-    """An arrow along (vx, vy), level even when the trunk is not: commands are meant in the plane. `per_speed` [robot radius per m/s]."""
+    """Append an arrow along (vx, vy). It is horizontal even if the trunk tilts. `per_speed`: [robot radius per m/s]."""
     speed = math.hypot(velocity[0], velocity[1])
     if speed < SPEED_MIN:
         return
-    per_speed = min(per_speed, 1.1 * ARROW_MAX / speed)  # a robot that was pushed is faster than any command
+    per_speed = min(per_speed, 1.1 * ARROW_MAX / speed)  # a pushed robot can be faster than any command
     cos, sin = math.cos(placement.heading), math.sin(placement.heading)
     along = np.array([cos * velocity[0] - sin * velocity[1], sin * velocity[0] + cos * velocity[1], 0.0])
     tip = origin + per_speed * placement.radius * along
@@ -95,7 +95,7 @@ def _draw_straight(
 def _draw_turn(
     scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, rate: float, rgba: tuple[float, ...]
 ) -> None:
-    """A bent arrow around the vertical: it starts in front of the robot and turns with the yaw rate."""
+    """Append a bent arrow around the vertical. It starts in front of the robot and turns with the yaw rate."""
     if abs(rate) < RATE_MIN:
         return
     angle = math.copysign(min(ARC_PER_RATE * abs(rate), ARC_MAX), rate)
@@ -111,14 +111,14 @@ def _draw_turn(
 
 
 def _draw_contacts(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
-    """A disc under each foot on the ground, as long and as wide as what touches it."""
+    """Append a disc under each foot in contact, with the length and width of its contact patch."""
     thick = DISC * robots.radius
     for place, turn, half in robots.patches(moment.contacts):
         draw_disc(scene, Patch(place + (0.0, 0.0, 1.3 * thick), turn, half), thick, CONTACT_RGBA)
 
 
 def draw_disc(scene: mujoco.MjvScene, patch: Patch, thick: float, rgba: tuple[float, ...]) -> None:
-    """Append an upright disc of twice ``thick`` [m] with its middle at the patch's place."""
+    """Append a horizontal disc at the patch. ``thick``: half thickness [m]."""
     disc = _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (patch.half[0], thick, 0.0), patch.place, rgba)
     if disc is not None:
         disc.size[1] = patch.half[1]
@@ -126,7 +126,7 @@ def draw_disc(scene: mujoco.MjvScene, patch: Patch, thick: float, rgba: tuple[fl
 
 
 def _draw_ghosts(scene: mujoco.MjvScene, robots: PosedRobots, qpos: FloatArray) -> None:
-    """A transparent robot where each is to be."""
+    """Append a transparent robot at each reference pose."""
     first, option = scene.ngeom, mujoco.MjvOption()
     show_groups(option)
     moving = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
@@ -136,14 +136,14 @@ def _draw_ghosts(scene: mujoco.MjvScene, robots: PosedRobots, qpos: FloatArray) 
 
 
 def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:
-    """A ball with the word "fell" where the robot was when it fell."""
+    """Append a ball with the word "fell" at the place of a fall."""
     _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.35 * radius,) * 3, place, FALL_RGBA, "fell")
 
 
 def connect(
     scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray, end: FloatArray, rgba: tuple[float, ...]
 ) -> None:
-    """Append a capsule or an arrow from ``start`` to ``end``; of an arrow MuJoCo draws half."""
+    """Append a capsule or an arrow from ``start`` to ``end``. MuJoCo draws an arrow at half of that length."""
     geom = _add(scene, kind, (0.0, 0.0, 0.0), start, rgba)
     if geom is not None:
         mujoco.mjv_connector(geom, kind, width, start, end)
@@ -157,13 +157,13 @@ def _add(
     rgba: tuple[float, ...],
     label: str = "",
 ) -> mujoco.MjvGeom | None:
-    """One geom; None where the scene is full."""
+    """Append one geom; None if the scene is full."""
     if scene.ngeom >= scene.maxgeom:
         return None
     geom = scene.geoms[scene.ngeom]
     mujoco.mjv_initGeom(geom, kind, np.array(size), place, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32))
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow on the robot
-    geom.emission = 0.5  # reads the same in shade
+    geom.emission = 0.5  # same colour in shadow
     geom.label = label
     scene.ngeom += 1
     return geom

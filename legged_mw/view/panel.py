@@ -1,7 +1,7 @@
-"""The web page's panel, in Dear ImGui: numbers, sliders, buttons, keys and curves, for one pilot.
+"""The web page's panel in Dear ImGui: numbers, sliders, buttons, keys and curves, for one pilot.
 
-The viewer's thread builds it for every picture from the last moment and the pilot; it draws no robot. ImGui ends the
-process where a block is left open, so everything that may fail is computed before.
+The viewer's thread builds the panel for every picture from the last moment and the pilot. ImGui ends the process if an
+exception leaves a block open, so all code that can fail runs before a block is opened.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from legged_mw.view.overlay import COMMAND_RGBA, VELOCITY_RGBA
 from legged_mw.view.stage import FloatArray, Moment, velocity_columns
 
 CURVE_SECONDS, CURVE_POINTS = 10.0, 100
-WIDTH, COLUMN = 330, 90  # [px] of the panel, where its second column begins
+WIDTH, COLUMN = 330, 90  # [px] width of the panel, start of its second column
 _KEYS = {  # ours -> ImGui's
     **{"up": "UpArrow", "down": "DownArrow", "left": "LeftArrow", "right": "RightArrow"},
     **{"space": "Space", "backspace": "Backspace", "enter": "Enter", "-": "Minus", "=": "Equal"},
@@ -30,13 +30,16 @@ BUTTONS = (  # rows of (action, label)
 
 
 class Curves:
-    """Velocity and command of the followed robot over the last seconds. `rows` is replaced, never changed: any thread may read it."""
+    """Velocity and command of the followed robot over the last seconds.
+
+    Any thread may read `rows`: it is replaced, never modified.
+    """
 
     def __init__(self, commands: int) -> None:
         self.rows = np.zeros((0, 4 + commands))  # time, velocity (3,), command (C,)
 
     def add(self, moment: Moment) -> None:
-        """Keep a moment; at most CURVE_POINTS of them."""
+        """Add a moment, and keep the last CURVE_POINTS."""
         row = np.concatenate([[moment.time], moment.velocity[moment.world], moment.commands[moment.world]])
         rows = self.rows
         if len(rows) and moment.time - rows[-1, 0] < 0.999 * CURVE_SECONDS / CURVE_POINTS:
@@ -45,7 +48,7 @@ class Curves:
 
 
 class Panel:
-    """The panel. `ui` and `plot` are the modules of ImGui and ImPlot."""
+    """The panel. `ui`, `plot`: the modules of ImGui and ImPlot."""
 
     def __init__(self, pilot: Pilot, title: str, ui: Any, plot: Any) -> None:
         self.pilot, self.title, self.ui, self.plot = pilot, title, ui, plot
@@ -54,7 +57,7 @@ class Panel:
         self.moment: Moment | None = None  # the last one
 
     def show(self, moment: Moment) -> None:
-        """Show this moment from now on. The session's thread calls it."""
+        """Set the moment to show. Called by the session's thread."""
         self.curves.add(moment)
         self.moment = moment
 
@@ -71,7 +74,7 @@ class Panel:
             ui.SetNextWindowCollapsed(True)
         try:
             opened, kept = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
-            self._folded = not kept  # the cross folds the panel, a click on the title unfolds it
+            self._folded = not kept  # the close button folds the panel, a click on the title unfolds it
             if opened:
                 self._numbers(moment)
                 if "own" in self.pilot.can:
@@ -97,12 +100,12 @@ class Panel:
             if name in colours:
                 ui.TextColored(ui.Vec4(*colours[name]), name)
             else:
-                ui.Text(name)  # in the theme's colour
+                ui.Text(name)  # in the colour of the theme
             ui.SameLine(COLUMN)
             ui.TextWrapped(value)
 
     def _sliders(self, moment: Moment) -> None:
-        """A slider for each command; dragging one drives the robot."""
+        """Draw a slider for each command. Dragging it drives the robot."""
         ui, pilot = self.ui, self.pilot
         command = np.array(pilot.command if pilot.driving else moment.commands[moment.world])
         ui.SeparatorText("command")
@@ -138,7 +141,7 @@ class Panel:
             pilot.ask("everyone")
 
     def _label(self, action: str, label: str) -> str:
-        """What the button will do; ImGui knows it by the part after ###."""
+        """The text of a button. ImGui identifies the button by the part after ###."""
         pilot = self.pilot
         words = {
             **pilot.words,
@@ -149,7 +152,7 @@ class Panel:
         return f"{words.get(action, label)}###{action}"
 
     def _click(self, action: str) -> None:
-        """Do what the button's key does; the button for speed goes round."""
+        """Do the action of the button's key. The speed button cycles through the speeds."""
         pilot = self.pilot
         if action == "slower" and pilot.speed == SPEEDS[-1]:
             for _ in SPEEDS[1:]:
@@ -158,7 +161,7 @@ class Panel:
             pilot.ask(action)
 
     def _curves(self) -> None:
-        """A plot for each command, with the measured velocity where it is one."""
+        """Draw a plot for each command, with the measured velocity if the command is a velocity."""
         ui, plot, rows, table = self.ui, self.plot, self.curves.rows, self.pilot.table
         if not len(rows) or not table:
             return

@@ -21,24 +21,24 @@ from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
 from legged_mw.view.follow import Newest
 
-NOMINAL = {  # what playing changes in the trained config
+NOMINAL = {  # overrides of the trained config for playing
     "env.num_envs": 1,
-    "env.episode_length_s": 1e6,  # the robot that is watched walks on where training would begin a new episode
+    "env.episode_length_s": 1e6,  # the watched robot walks on after the episode length of training
     "noise.level": 0.0,
     "perturbation.kick": False,
     "perturbation.push": False,
     "domain_rand.enable": False,
     "commands.curriculum": False,
     "gait.random_start": False,
-    "motion.random_start": False,  # from a clip's start to its end
+    "motion.random_start": False,  # play a clip from start to end
     "falls.pull": 0.0,
-    "falls.share": 1.0,  # of a task that gets up: a reset is another fall
+    "falls.share": 1.0,  # in a get-up task every reset is a fall
 }
-ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
+ROWS, BORDER = 3, 2.0  # of the terrain: levels from the easiest to the hardest, border [m]
 
 
 def parse(description: str | None) -> argparse.Namespace:
-    """The flags of playing."""
+    """Parse the flags of play."""
     parser = make_parser(description)
     parser.add_argument(
         "--command",
@@ -94,21 +94,24 @@ def parse(description: str | None) -> argparse.Namespace:
     launch.check_flags(args)
     if args.export is not None:
         writable(args.export, "--export", folder=True)
-    torch.set_num_threads(1)  # a step of few worlds stalls on more
+    torch.set_num_threads(1)  # with few worlds, more threads are slower
     return args
 
 
 def prepare(
     source: PolicySource, trained: LoadedTask, args: argparse.Namespace
 ) -> tuple[LoadedTask, tuple[Command, ...]]:
-    """The trained task with what playing changes, the user's overrides last, and its commands as trained; prints the changes."""
+    """Prepare a task for playing: apply the overrides of playing, then those of the user. Print the changes.
+
+    Returns the task, and the commands with their trained ranges.
+    """
     task = copy.deepcopy(trained)
     config = task.to_dict()
     for path, value in NOMINAL.items():
         section, _, field = path.partition(".")
         if field in config.get(section, {}):
             task.set(path, value, where="play")
-    apply_overrides(task, args)  # they say on what ground
+    apply_overrides(task, args)  # the overrides choose the terrain
     for path, value in ground_to_watch(task).items():
         task.set(path, value, where="play")
     apply_overrides(task, args)
@@ -126,7 +129,7 @@ def prepare(
 
 
 def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
-    """A grid that is soon drawn, in place of the whole one: few levels, a column and a robot a kind, the most frequent first."""
+    """Overrides for a terrain that draws fast: few levels, one column and one robot per kind, frequent kinds first."""
     terrain = task.to_dict()["terrain"]
     shares = terrain.get("terrain_proportions", {})
     kinds = sorted((kind for kind in shares if shares[kind] > 0), key=lambda kind: -shares[kind])
@@ -138,13 +141,13 @@ def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
         "terrain.num_cols": len(kinds),
         "terrain.border_size": BORDER,
         "terrain.terrain_proportions": dict.fromkeys(kinds, 1.0),
-        "terrain.curriculum": False,  # any level, drawn at each reset; else, where that is asked for, from the first one on
+        "terrain.curriculum": False,  # each reset draws a random level; with the curriculum on, from the first level up
         "terrain.max_init_terrain_level": 0,
     }
 
 
 def watch(source: PolicySource, task: LoadedTask, commands: tuple[Command, ...], args: argparse.Namespace) -> None:
-    """Show the policy in the environment of the task as it is played; ``commands`` have their ranges as trained."""
+    """Show the policy in the environment of the prepared task. ``commands`` have their trained ranges."""
     device = pick_device(args.device)
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)

@@ -1,4 +1,4 @@
-"""Robots placed by `qpos` alone, and the ground below them: kinematics, no dynamics. Opens no window, no file, no OpenGL context."""
+"""Robots posed by `qpos`, and the ground below them: kinematics only. Opens no window, no file, no OpenGL context."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -15,29 +15,29 @@ from legged_mw.view.feet import Patch, feet_of, patch
 from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 visuals; from 3 on collision shapes
-SHADOW_MAX, SHADOW_SIZE = 8.0, 4096  # [extent] half-width of the shadow map, [px] its edge: 4 mm a pixel at the most
-# each copy of a body would copy them too
+SHADOW_MAX, SHADOW_SIZE = 8.0, 4096  # shadow map: half width [extent], edge [px]; at most 4 mm per pixel
+# elements to delete, because attaching copies of a body would copy them too
 SEVERAL_WITHOUT = ("sensors", "actuators", "equalities", "tendons", "pairs", "excludes")
-PLAIN = (0.55, 0.57, 0.60, 1.0)  # colour of a link that has no looks
-SPACING = 3.0  # [robot radius] between robots that stand side by side
+PLAIN = (0.55, 0.57, 0.60, 1.0)  # colour of a link without visuals
+SPACING = 3.0  # [robot radius] distance between robots side by side
 
 
 class Placement(NamedTuple):
-    """Where a robot is in the picture."""
+    """The place and the extent of a robot in the picture."""
 
-    position: FloatArray  # of its base (3,) [m]
-    heading: float  # of its x axis on the ground [rad]
-    radius: float  # its size [m]
-    top: float  # its height above its base [m]
-    bottom: float = 0.0  # and its depth below it [m]
+    position: FloatArray  # (3,) [m] of the base
+    heading: float  # [rad] of the base's x axis, about the vertical
+    radius: float  # [m] size of the robot
+    top: float  # [m] top of the robot above its base
+    bottom: float = 0.0  # [m] lowest point below its base
 
 
 class PosedRobots:
-    """All robots of one picture as one `model` and its `data`, without dynamics.
+    """All robots of one picture as one `model` with its `data`, without dynamics.
 
-    The followed robot is always the first one in the model: its lights and cameras follow it, and a camera can track its
-    body `base`. Robots stand side by side, `offsets` (N, 3) apart; on rough ground each stays where it is. `radius`,
-    `top` and `bottom` [m] are measured in the model's first pose.
+    The followed robot is always the first one in the model, so lights and cameras follow it and a camera can track its
+    body `base`. `offsets` (N, 3) [m] place the robots side by side; on rough terrain they are zero. `radius`, `top` and
+    `bottom` [m] are measured in the model's first pose.
     """
 
     def __init__(self, spec: mujoco.MjSpec, count: int = 1) -> None:
@@ -50,22 +50,22 @@ class PosedRobots:
         self.count, self._nq = count, single.nq
         self.model, self._bases, self._feet = many_robots(spec, single, count)
         self.data, self.base = mujoco.MjData(self.model), self._bases[0]
-        self._ghost: mujoco.MjData | None = None  # made where there is one to draw
+        self._ghost: mujoco.MjData | None = None  # created for the first ghost
         self._forward()
         self.radius, self.top, self.bottom = self._measure()
         self.feet = self._feet[0]
         rough = has_places(self.model)
         self.offsets = np.zeros((count, 3)) if rough else side_by_side(count, SPACING * self.radius)
-        if count > 1 and not rough:  # one shadow map for all; on rough ground they are too far apart
+        if count > 1 and not rough:  # one shadow map for all; on rough terrain the robots are too far apart
             width = math.ceil(math.sqrt(count)) * SPACING * 0.5 / max(single.stat.extent, 1e-6)
             vis = self.model.vis
             vis.map.shadowclip = min(max(vis.map.shadowclip, width), SHADOW_MAX)
             vis.quality.shadowsize = max(vis.quality.shadowsize, SHADOW_SIZE)
-        self.pose(np.tile(single.qpos0, (count, 1)))  # a window may draw before the first moment is shown
+        self.pose(np.tile(single.qpos0, (count, 1)))  # a window may draw before the first moment
         self.ground = RoughGround(self.model, self.data) if len(height_fields(self.model)) else None
 
     def pose(self, qpos: ArrayLike, world: int = 0) -> None:
-        """Place all robots by the rows of `qpos` (N, nq), and follow robot `world`."""
+        """Pose all robots by the rows of `qpos` (N, nq), and follow robot `world`."""
         array = np.atleast_2d(np.array(qpos, dtype=np.float64))[: self.count]
         if array.shape[1:] != (self._nq,):
             raise ValueError(
@@ -76,14 +76,14 @@ class PosedRobots:
                 f"qpos[{int(np.argwhere(~np.isfinite(array))[0, 1])}] is not finite: the simulation diverged."
             )
         array[:, :3] += self.offsets
-        # robot of each copy in the model
+        # index of the robot for each copy in the model
         self._order = [world, *(index for index in range(self.count) if index != world)]
         self.data.qpos[:] = array[self._order].ravel()
         self._forward()
         self.placements: list[Placement] = [self._placement(self._order.index(index)) for index in range(self.count)]
 
     def ghost(self, qpos: ArrayLike) -> mujoco.MjData:
-        """The same robots at the rows of `qpos` (N, nq), in the order of the last `pose`."""
+        """The same robots posed by the rows of `qpos` (N, nq), in the order of the last `pose`."""
         array = np.array(qpos, dtype=np.float64)[: self.count]
         array[:, :3] += self.offsets
         data = self._ghost = self._ghost or mujoco.MjData(self.model)
@@ -92,7 +92,7 @@ class PosedRobots:
         return data
 
     def patches(self, contacts: ArrayLike) -> list[Patch]:
-        """Where feet touch: one for each foot of which `contacts` (N, G) marks a geom, the first G with a contact sensor."""
+        """The patches of the feet in contact. `contacts`: mask (N, G) of the first G geoms with a contact sensor."""
         touching = np.asarray(contacts, dtype=bool)[: self.count]
         if len(touching) < self.count or touching.shape[1] > len(self.feet):
             return []  # the model has fewer contact sensors
@@ -117,7 +117,7 @@ class PosedRobots:
         )
 
     def _measure(self) -> tuple[float, float, float]:
-        """Of what is seen of a robot, and its feet: largest distance from its base, height above it and depth below it [m]."""
+        """Extent of a robot's visuals and feet from its base [m]: largest distance, height above, depth below."""
         model = self.model
         robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.base]
         seen = {*map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))), *self._feet[0]}
@@ -129,7 +129,7 @@ class PosedRobots:
 
 
 def boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Centres and half edges (G, 3) [m] of the upright boxes around ``geoms``."""
+    """Centres and half edges (G, 3) [m] of the axis-aligned boxes around ``geoms``, world frame."""
     rotation, box = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms]
     centres = data.geom_xpos[geoms] + (rotation @ box[:, :3, None])[..., 0]
     return centres, (np.abs(rotation) @ box[:, 3:, None])[..., 0]
@@ -138,9 +138,9 @@ def boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: ArrayLike) -> tuple
 def many_robots(
     spec: mujoco.MjSpec, single: mujoco.MjModel, count: int
 ) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:
-    """`count` copies of the robot of `spec` as one model for drawing: nothing collides, and one robot has the lights and cameras.
+    """A model for drawing: `count` copies of the robot of `spec`. Nothing collides; one copy has lights and cameras.
 
-    Returns also the base of each copy, and each copy's geoms with a contact sensor, in the order of the sensors.
+    Also returns the base of each copy, and for each copy the geoms with a contact sensor, in the order of the sensors.
     """
     spec = spec.copy()
     contact, geom = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtObj.mjOBJ_GEOM
@@ -149,7 +149,7 @@ def many_robots(
         for element in getattr(spec, kind):
             spec.delete(element)
     for body in spec.bodies[1:]:
-        # it has no looks: its collision shapes are better than nothing
+        # a body without visuals: show its collision shapes
         if all(shape.group >= GROUPS_SHOWN for shape in body.geoms):
             for shape in body.geoms:
                 shape.group, shape.rgba = GROUPS_SHOWN - 1, PLAIN
@@ -171,13 +171,13 @@ def many_robots(
 
 
 def has_places(model: mujoco.MjModel) -> bool:
-    """Whether the ground is more than planes, so that it matters where a robot is."""
+    """Whether the ground has more than planes, so the place of a robot matters."""
     fixed = model.body_weldid[model.geom_bodyid] == 0
     return bool((fixed & (model.geom_group < GROUPS_SHOWN) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).any())
 
 
 def side_by_side(count: int, spacing: float) -> FloatArray:
-    """Places (N, 3) on a square grid [m], the first at the origin, the others ahead of it and to its left."""
+    """Places (N, 3) [m] on a square grid: the first at the origin, the others in front of it and to its left."""
     columns = math.ceil(math.sqrt(count))
     index = np.arange(count)
     return np.stack([index // columns, index % columns, np.zeros(count)], axis=1).astype(np.float64) * spacing
@@ -190,9 +190,9 @@ def show_groups(option: mujoco.MjvOption) -> None:
 
 
 class RoughGround:
-    """All height fields of a model, at places (T, 2) with half edges (T, 2) [m], world frame; they do not move.
+    """All height fields of a model, with centres (T, 2) and half edges (T, 2) [m], world frame. They do not move.
 
-    Where two are at the same place, one is a coarse copy of the other and is hidden at first.
+    Of two height fields at the same place, one is a coarse copy of the other and is hidden at first.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -203,14 +203,14 @@ class RoughGround:
             x, y = np.round(data.geom_xpos[geom, :2], 6)
             found.setdefault((x, y), []).append(int(geom))
         self._model = model
-        # (T,), the same if alone
+        # (T,) geoms; equal if there is no coarse copy
         self.fine, self.coarse = (np.array([same[which] for same in found.values()]) for which in (0, -1))
         self.places: FloatArray = np.array(list(found))
         self.halves: FloatArray = np.array([model.hfield_size[model.geom_dataid[geom], :2] for geom in self.fine])
         self._bottoms: FloatArray = np.array(data.geom_xpos[self.fine, 2])
 
     def height(self, place: FloatArray) -> float:
-        """Height [m] of the vertex nearest to `place` (2,) [m]; 0 outside of all tiles."""
+        """Height [m] of the vertex nearest to `place` (2,) [m]; 0 outside all tiles."""
         inside = np.flatnonzero((np.abs(self.places - place) <= self.halves).all(axis=1))
         if not len(inside):
             return 0.0
@@ -223,7 +223,7 @@ class RoughGround:
         return float(vertex * model.hfield_size[field, 2] + self._bottoms[tile])
 
     def refine(self, place: FloatArray, reach: float) -> None:
-        """Draw the tiles within `reach` [m] of `place` (2,) finely, the others coarsely."""
+        """Draw the fine tiles within `reach` [m] of `place` (2,) [m], and the coarse ones elsewhere."""
         near = (np.maximum(np.abs(self.places - place) - self.halves, 0.0) ** 2).sum(axis=1) < reach**2
         self._model.geom_rgba[self.coarse, 3] = ~near
         self._model.geom_rgba[self.fine, 3] = near | (self.fine == self.coarse)

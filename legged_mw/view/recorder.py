@@ -1,6 +1,6 @@
-"""Pictures without a screen: an offscreen renderer of a moment, and the viewer that records a video and a contact sheet.
+"""Pictures without a screen: an offscreen renderer, and a viewer that records a video and a contact sheet.
 
-`MUJOCO_GL` must be set before mujoco is imported; the package does it.
+`MUJOCO_GL` must be set before mujoco is imported. The package does that.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -19,18 +19,18 @@ from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment, ViewError
 from legged_mw.view.video import Frame, VideoWriter, contact_sheet, save_png
 
-# ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
+# ours: edge of the shadow map [px]; the common value 8192 halves the frame rate of software OpenGL
 SHADOW_MAX = 2048
 GEOMS_MAX = 20_000
-# [m] beyond the camera's distance: tiles of rough ground farther from what it looks at are drawn coarsely
+# [m] beyond the camera's distance: terrain tiles farther than that from its target are drawn coarse
 FINE_REACH = 3.0
-TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller letters
-SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, pictures in a row, width of a picture at most [px]
-GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF counts in hundredths of a second, and grows large with more of either
+TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller fonts
+SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, pictures per row, largest width of a picture [px]
+GIF_FPS, GIF_WIDTH = 12.5, 640  # GIF times are in 0.01 s; larger values make large files
 
 
 class RobotRenderer:
-    """Offscreen pictures of some robots from a camera that follows one. Use it from the thread that made it."""
+    """Offscreen pictures of robots from a camera that follows one. Use it only on the thread that created it."""
 
     def __init__(self, spec: mujoco.MjSpec, width: int = 1280, height: int = 720, count: int = 1) -> None:
         self.robots = PosedRobots(spec, count)
@@ -53,24 +53,24 @@ class RobotRenderer:
             self._renderer = mujoco.Renderer(
                 self.robots.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font
             )
-        except Exception as error:  # each OpenGL backend fails with a type of its own
+        except Exception as error:  # each OpenGL backend raises another type
             raise ViewError(no_context(error)) from error
 
     def frame(self, moment: Moment, frames: float = 1.0) -> Frame:
-        """One picture (height, width, 3), yours to keep; `frames` of a video passed since the last call."""
+        """A picture (height, width, 3) as a new array. `frames`: video frames since the last call."""
         self.robots.pose(moment.qpos, moment.world)
         camera, scene = self._camera.update(moment.camera, moment.world, frames), self._renderer.scene
         if self.robots.ground is not None:
             self.robots.ground.refine(camera.lookat[:2], FINE_REACH + camera.distance)
-        # MuJoCo lays an endless floor around the camera's last position; this makes it right in the first frame too
+        # MuJoCo draws an infinite floor around the camera's last position: update it, also for the first frame
         mujoco.mjv_updateCamera(self.robots.model, self.robots.data, camera, scene)
         self._renderer.update_scene(self.robots.data, camera, self._option)
         draw(scene, self.robots, moment)
-        frame = self._renderer.render()  # a new array each time
+        frame = self._renderer.render()  # a new array at each call
         return self._write(frame, moment.lines) if moment.lines else frame
 
     def _write(self, frame: Frame, lines: tuple[tuple[str, str], ...]) -> Frame:
-        """Write the lines over the picture that was just drawn, and read it again."""
+        """Write the lines of text over the last picture, and read the picture again."""
         renderer = self._renderer
         names, values = ("\n".join(column) for column in zip(*lines, strict=True))
         place = mujoco.mjtGridPos.mjGRID_TOPLEFT
@@ -80,12 +80,12 @@ class RobotRenderer:
         return frame
 
     def close(self) -> None:
-        """Free the OpenGL context; again is allowed."""
+        """Free the OpenGL context. May be called twice."""
         self._renderer.close()
 
 
 def no_context(error: Exception) -> str:
-    """What to do where there is no OpenGL context for drawing without a screen."""
+    """The advice for a machine without an OpenGL context for offscreen drawing."""
     state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
     return (
         f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"
@@ -95,14 +95,14 @@ def no_context(error: Exception) -> str:
 
 
 class Recorder:
-    """The viewer that writes files: `video` (MP4 or GIF), `sheet` (a PNG of pictures from the whole run), or both."""
+    """A viewer that writes files: `video` (MP4 or GIF), `sheet` (a PNG of pictures from the whole run), or both."""
 
     def __init__(
         self,
         spec: mujoco.MjSpec,
         count: int,
-        dt: float,  # [s] between two moments
-        seconds: float,  # length of the run [s]; the sheet's pictures are spread over it
+        dt: float,  # [s] time between two moments
+        seconds: float,  # [s] length of the run; the pictures of the sheet are evenly spaced in it
         *,
         video: Path | None,
         sheet: Path | None,
@@ -118,7 +118,7 @@ class Recorder:
         self._sheet_times = [index * seconds / SHEET_FRAMES for index in range(SHEET_FRAMES)] if sheet else []  # [s]
         self._pictures: list[Frame] = []
         self._turn = self._drawn = 0
-        # the files' names are checked before a context is made, and an old file stays if that fails
+        # check the file names before creating a context; if that fails, an old file stays
         self._writer = VideoWriter(video, width, height, 1 / (self._every * dt)) if video else None
         try:
             self._renderer = RobotRenderer(spec, width, height, count)
@@ -127,7 +127,7 @@ class Recorder:
             raise
 
     def show(self, moment: Moment) -> None:
-        """Record a frame, if one is due."""
+        """Record a frame if its time has come."""
         film = self._writer is not None and self._turn % self._every == 0
         still = (
             len(self._pictures) < len(self._sheet_times)
@@ -144,11 +144,11 @@ class Recorder:
             self._pictures.append(shrunk(frame, SHEET_WIDTH))
 
     def is_running(self) -> bool:
-        """Always True: nobody closes a file from outside."""
+        """Always True: the user cannot close a file."""
         return True
 
     def close(self) -> None:
-        """Finish the files; again is allowed."""
+        """Finish the files. May be called twice."""
         self._renderer.close()
         if self._writer is not None:
             self._writer.close()
@@ -157,13 +157,13 @@ class Recorder:
             self._pictures = []
 
     def abort(self) -> None:
-        """Drop the files; older ones of these names stay."""
+        """Discard the files. Older files with these names stay."""
         if self._writer is not None:
             self._writer.abort()
 
 
 def shrunk(frame: Frame, width: int) -> Frame:
-    """The frame at most `width` wide: the mean of squares of pixels."""
+    """The frame, shrunk to at most `width` [px] by averaging square blocks of pixels."""
     factor = -(-frame.shape[1] // width)
     rows, columns = frame.shape[0] // factor, frame.shape[1] // factor
     squares = frame[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor, 3)

@@ -1,9 +1,9 @@
-"""A script of timed commands, from a YAML file:
+"""A script of timed commands from a YAML file:
 
 commands:
   - {time: 0, command: [0.5, 0, 0]}      # in the order of the task's commands, held until the next one
-  - {time: 3, command: {lin_vel_x: 1.0, base_height: 0.25}}    # or by name; the others take their defaults
-  - {time: 6, push: [0, 1.5]}            # added to the horizontal velocity at once, world frame [m/s]
+  - {time: 3, command: {lin_vel_x: 1.0, base_height: 0.25}}    # or by name; others get their defaults
+  - {time: 6, push: [0, 1.5]}            # [m/s] jump of the horizontal velocity, world frame
   - {time: 9, reset: true}
 """
 
@@ -20,11 +20,11 @@ from legged_mw.utils.errors import unknown
 from legged_mw.view.drive import NO_COMMANDS, PUSH_MAX, Pilot
 
 FIELDS = ("time", "command", "push", "reset")
-AFTER = 3.0  # [s] ours: how long to watch after the last entry
+AFTER = 3.0  # [s] ours: time to watch after the last entry
 
 
 class ScriptEntry(NamedTuple):
-    """What happens at a time."""
+    """A command, a push or a reset at a time."""
 
     time: float  # [s]
     command: list[float] | None = None  # (C,)
@@ -33,7 +33,7 @@ class ScriptEntry(NamedTuple):
 
 
 class Script:
-    """Entries in their order; the pilot gets each once its time has come."""
+    """Entries in the order of time. The pilot gets each entry at its time."""
 
     def __init__(self, entries: list[ScriptEntry]) -> None:
         self.entries = entries
@@ -41,11 +41,11 @@ class Script:
 
     @property
     def seconds(self) -> float:
-        """How long to watch it."""
+        """Duration of the script [s]."""
         return self.entries[-1].time + AFTER
 
     def play(self, time: float, pilot: Pilot) -> None:
-        """Give the pilot all entries up to `time` [s]."""
+        """Pass all entries up to `time` [s] to the pilot."""
         while self._next < len(self.entries) and self.entries[self._next].time <= time + 1e-9:
             entry = self.entries[self._next]
             self._next += 1
@@ -58,9 +58,9 @@ class Script:
 
 
 def load_script(path: Path | str, table: Sequence[Command]) -> Script:
-    """The script in a file, for a task with these commands. A command outside of the trained ranges is refused, not clipped.
+    """Load a script for a task with these commands. A command outside the trained ranges is an error, not clipped.
 
-    Raises ConfigError that names the file and the entry.
+    Raises ConfigError with the file and the entry.
     """
     loaded = load_yaml(path)
     listed = loaded.get("commands")
@@ -100,9 +100,9 @@ def _entry(item: Any, where: str, table: Sequence[Command]) -> ScriptEntry:
 
 
 def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
-    """Values (C,) from a list in the order of the table or a mapping by name; what is missing takes its default.
+    """Values (C,) from a list in the order of the table, or from a mapping by name. Others get their defaults.
 
-    A list has all, or vx, vy and yaw rate.
+    A list has all commands, or vx, vy and yaw rate.
     """
     if not table:
         raise ConfigError(f"{where}: {NO_COMMANDS}")
@@ -113,7 +113,7 @@ def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
                 raise ConfigError(f"{where}: {unknown('command', str(name), names, 'this task')}")
             [command[names.index(name)]] = _numbers(number, [1], f"{where}: {name}", "a number")
     else:
-        # a robot's own may be left out
+        # the commands after the velocity may be left out
         whole = [len(table), *([len(VELOCITY)] if tuple(names[: len(VELOCITY)]) == VELOCITY else [])]
         values = _numbers(value, whole, where, f"a list of {with_units(table)}, or {{name: value}}")
         command[: len(values)] = values
@@ -131,9 +131,9 @@ def _numbers(value: Any, counts: Sequence[int], where: str, form: str) -> list[f
 
 
 def parse_command(text: str, table: Sequence[Command]) -> list[float]:
-    """Values (C,) from ``0.5,0,0``, in the order of the table, or ``base_height=0.3``; all others keep their default.
+    """Values (C,) from ``0.5,0,0`` in the order of the table, or from ``base_height=0.3``. Others get their defaults.
 
-    Raises ConfigError for an unknown name, too many numbers, or a value outside of its range.
+    Raises ConfigError for an unknown name, too many numbers, or a value outside its range.
     """
     names, values = [c.name for c in table], [c.default for c in table]
     for place, item in enumerate(text.split(",")):
@@ -157,7 +157,7 @@ def parse_command(text: str, table: Sequence[Command]) -> list[float]:
 
 
 def outside(values: Sequence[float], table: Sequence[Command]) -> str:
-    """The first of the values (C,) outside of its trained range, in words; "" if there is none."""
+    """The first of the values (C,) outside its trained range, as text; "" if there is none."""
     for value, command in zip(values, table, strict=True):
         if not command.low - 1e-9 <= value <= command.high + 1e-9:
             unit = f" {command.unit}" if command.unit else ""

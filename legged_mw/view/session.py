@@ -1,6 +1,6 @@
-"""The loop of watching: ask the pilot, step the stage, show the moment, keep real time, and count what happened.
+"""The loop of a session: read the pilot, step the stage, show the moment, keep real time, count falls and velocities.
 
-Knows no viewer and no physics by name; `stage.py` has the protocols of both.
+It depends only on the protocols of `stage.py`, not on any viewer or physics.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from legged_mw.view.drive import Pilot
 from legged_mw.view.script import Script
 from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity, top_speed
 
-FALL_SECONDS = 2.0  # ours: how long the place of a fall is shown
-SETTLING = 1.0  # [s] ours: left out of a segment's mean velocity if the segment is longer than twice that
-PACE_SECONDS = 0.5  # over which the pace is measured
+FALL_SECONDS = 2.0  # ours: [s] display time of the place of a fall
+SETTLING = 1.0  # [s] ours: start of a segment to leave out of its mean velocity, if it lasts longer than twice this
+PACE_SECONDS = 0.5  # [s] interval for measuring the pace
 MEASURED = ", ".join(LABELS.values())
 
 
@@ -28,19 +28,19 @@ class Segment(NamedTuple):
     start: float  # [s]
     seconds: float
     command: FloatArray  # (C,)
-    velocity: FloatArray  # (3,) mean after settling
+    velocity: FloatArray  # (3,) mean of vx, vy, yaw rate after settling
 
 
 class Outcome(NamedTuple):
-    """What happened in a session; segments are of the followed robot."""
+    """The result of a session. Segments are those of the followed robot."""
 
     seconds: float
-    falls: int  # of all robots
+    falls: int  # number of falls of all robots
     segments: list[Segment]
     table: Sequence[Command] = ()
 
     def text(self) -> str:
-        """A line, then a table of the last twenty segments at most."""
+        """A summary line, then a table of at most the last twenty segments."""
         lines = [f"{self.seconds:.1f} s, {self.falls} {'fall' if self.falls == 1 else 'falls'}"]
         commanded = f"commanded: {with_units(self.table) or 'nothing'}"
         if self.segments:
@@ -53,19 +53,19 @@ class Outcome(NamedTuple):
 
 
 def signed(values: FloatArray) -> str:
-    """Numbers of constant width."""
+    """Numbers with sign, in constant width."""
     return " ".join(f"{value + 0.0:+.2f}" for value in np.round(values, 2))
 
 
 class Pace:
-    """Holds a loop to one turn every `dt` seconds of real time."""
+    """Limits a loop to one turn every `dt` [s] of real time."""
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
         self._next = time.perf_counter() + dt
 
     def wait(self) -> None:
-        """Sleep until this turn is over. Turns after a late one take no less time."""
+        """Sleep until the end of this turn. A late turn is not caught up."""
         now = time.perf_counter()
         if self._next > now:
             time.sleep(self._next - now)
@@ -75,7 +75,7 @@ class Pace:
 
 
 class Session:
-    """One stage before one viewer, until the viewer is closed, `seconds` have passed, or Ctrl-C."""
+    """Show one stage in one viewer until the viewer is closed, `seconds` have passed, or Ctrl-C."""
 
     def __init__(
         self,
@@ -93,10 +93,10 @@ class Session:
         self._fallen: BoolArray = np.zeros(stage.num_worlds, dtype=bool)
         self._recent_falls: list[tuple[float, Fall]] = []
         self._segments: list[Segment] = []
-        self._since, self._followed = 0.0, np.zeros(0)  # of the current segment: its start [s] and command
-        self._velocities: list[FloatArray] = []  # and one velocity a step
+        self._since, self._followed = 0.0, np.zeros(0)  # start [s] and command of the current segment
+        self._velocities: list[FloatArray] = []  # and its velocities, one per step
         self._pace = Pace(stage.dt)
-        self._measured = (time.perf_counter(), 0, 0.0)  # since when, steps then, share of real time
+        self._measured = (time.perf_counter(), 0, 0.0)  # start of the interval, steps at that time, share of real time
 
     @property
     def time(self) -> float:
@@ -104,7 +104,7 @@ class Session:
         return self.steps * self.stage.dt
 
     def run(self) -> Outcome:
-        """Turn after turn; Ctrl-C ends it as closing the viewer does."""
+        """Run all turns. Ctrl-C ends the session as if the viewer were closed."""
         try:
             while self.viewer.is_running() and (self.seconds is None or self.time < self.seconds - 1e-9):
                 self.turn()
@@ -114,7 +114,7 @@ class Session:
         return Outcome(self.time, self.falls, self._segments, self.stage.command_table)
 
     def turn(self) -> None:
-        """Show the moment, then do one control step as the pilot wants it."""
+        """Show the moment, then do one control step under the pilot's commands."""
         self._listen()
         commands = self.pilot.commands(self.stage.commands())
         self.viewer.show(self._moment(commands))
@@ -149,7 +149,7 @@ class Session:
         self._note(followed, stage.velocity()[self.pilot.world])
 
     def _note(self, command: FloatArray, velocity: FloatArray) -> None:
-        """Add a step to the segment, or begin one where the command changed."""
+        """Add a step to the current segment, or start a new one if the command has changed."""
         if not self._velocities or not np.allclose(self._followed, command, atol=1e-6):
             self._end_segment()
             self._since, self._followed = self.time - self.stage.dt, np.array(command)
@@ -190,7 +190,7 @@ class Session:
             lines.append(("estimated", signed(believed[pilot.world])))
         if stage.command_table:
             lines = [("command", signed(command)), *lines, ("driven by", self._driver())]
-        if news := getattr(stage, "news", ""):  # of a stage whose policy trains on
+        if news := getattr(stage, "news", ""):  # from a stage that reloads its policy
             lines.append(("policy", news))
         if stage.num_worlds > 1:
             lines.append(("robot", f"{pilot.world + 1} of {stage.num_worlds}"))
@@ -210,7 +210,7 @@ class Session:
         return "you, all robots" if self.pilot.everyone and self.stage.num_worlds > 1 else "you"
 
     def _tempo(self) -> str:
-        """The pace, where real time matters."""
+        """The pace as text; empty without real time."""
         if self.pilot.paused:
             return ", paused"
         if not self.real_time:

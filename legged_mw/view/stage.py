@@ -1,7 +1,7 @@
-"""The two protocols of watching: a stage has moving robots, a viewer shows a moment of it. Types only.
+"""The two protocols of watching: a stage moves robots, a viewer shows a moment of them. Types only.
 
-A stage may be the training environment or any other physics; a viewer may be a window, a web page or a file. Neither
-knows the other: `session.py` steps the stage and hands moments to the viewer. In `view/` only `env_stage.py` uses torch.
+A stage is the training environment or another physics; a viewer is a window, a web page or a file. Neither knows the
+other: `session.py` steps the stage and passes moments to the viewer. In `view/` only `env_stage.py` imports torch.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -23,22 +23,22 @@ BoolArray = NDArray[np.bool_]
 
 
 class ViewError(UserError, RuntimeError):
-    """Nothing can be shown or recorded as asked; the text says what this machine lacks and what to do."""
+    """Showing or recording failed. The text names what this machine lacks and what to do."""
 
 
 class Stage(Protocol):
-    """N robots in N separate worlds. They follow C commands; a stage with C = 0 cannot be driven. Arrays handed out are the caller's."""
+    """N robots in N separate worlds, with C commands. With C = 0 it cannot be driven. Returned arrays are copies."""
 
     spec: mujoco.MjSpec  # one robot with its scene, for drawing
     num_worlds: int
     dt: float  # control step [s]
-    command_table: tuple[Command, ...]  # (C,) with the ranges as trained
+    command_table: tuple[Command, ...]  # (C,) with the trained ranges
 
     def step(self, commands: FloatArray | None) -> None:
-        """One control step of all worlds under `commands` (N, C); None: under the stage's own."""
+        """Do one control step of all worlds under `commands` (N, C). None: the stage's own commands."""
 
     def commands(self) -> FloatArray:
-        """The command of each robot now (N, C)."""
+        """The current command of each robot (N, C)."""
         ...
 
     def velocity(self) -> FloatArray:
@@ -46,7 +46,7 @@ class Stage(Protocol):
         ...
 
     def believed_velocity(self) -> FloatArray | None:
-        """vx, vy (N, 2) that the policy believed when it acted last, as in `velocity`; None if it estimates none."""
+        """The policy's estimate of vx, vy (N, 2) at its last action, as in `velocity`; None without an estimator."""
         ...
 
     def qpos(self) -> FloatArray:
@@ -54,80 +54,80 @@ class Stage(Protocol):
         ...
 
     def ghost(self) -> FloatArray | None:
-        """What each robot is to follow (N, nq); None where it follows no motion."""
+        """The reference pose of each robot (N, nq), world frame; None without a reference motion."""
         ...
 
     def contacts(self) -> BoolArray:
-        """Which geoms of the feet touch the ground (N, G), in the order of the model's first G contact sensors."""
+        """Mask (N, G) of the foot geoms in contact, in the order of the model's first G contact sensors."""
         ...
 
     def fell(self) -> BoolArray:
-        """Which robots fell in the last step (N,)."""
+        """Mask (N,) of the robots that fell in the last step."""
         ...
 
     def ground(self, world: int) -> str:
-        """The ground below a robot, in words; empty where that is a plane."""
+        """The kind of ground below a robot as text; empty for a plane."""
         ...
 
     def push(self, world: int, velocity: FloatArray) -> None:
-        """Add (2,) [m/s], world frame, to the robot's horizontal velocity at once."""
+        """Add `velocity` (2,) [m/s], world frame, to the robot's horizontal velocity."""
 
     def reset(self, world: int) -> None:
-        """Put one robot back to its start."""
+        """Reset one robot to its start state."""
 
 
 class Fall(NamedTuple):
-    """Where a robot fell."""
+    """The fall of a robot."""
 
     world: int
-    place: FloatArray  # (3,) of the base one step before, in that world's frame [m]
+    place: FloatArray  # (3,) [m] of the base one step before, world frame
 
 
 class Moment(NamedTuple):
-    """All that a viewer shows of one instant."""
+    """The content of one picture."""
 
     time: float  # [s]
     qpos: FloatArray  # (N, nq)
     commands: FloatArray  # (N, C)
-    target_velocity: FloatArray  # (N, 3) commanded vx, vy, yaw rate; NaN where there is no such command
-    velocity: FloatArray  # (N, 3) measured
+    target_velocity: FloatArray  # (N, 3) commanded vx, vy, yaw rate; NaN for a missing command
+    velocity: FloatArray  # (N, 3) measured vx, vy, yaw rate
     contacts: BoolArray  # (N, G)
     falls: tuple[Fall, ...] = ()  # the latest ones
-    world: int = 0  # the robot that is followed, driven and measured
+    world: int = 0  # index of the followed robot
     camera: str = "follow"  # one of drive.CAMERAS
-    lines: tuple[tuple[str, str], ...] = ()  # text to show: (name, value)
+    lines: tuple[tuple[str, str], ...] = ()  # text lines: (name, value)
     help: bool = False  # show the keys
-    ghost: FloatArray | None = None  # (N, nq) what robots follow
-    top_speed: float = 1.0  # [m/s] the fastest that robots can be commanded to go: arrows are drawn to fit it
+    ghost: FloatArray | None = None  # (N, nq) reference poses
+    top_speed: float = 1.0  # [m/s] fastest command; it scales the arrows
 
 
 class Viewer(Protocol):
     """Shows moments until it is closed."""
 
     def show(self, moment: Moment) -> None:
-        """Show one moment; does nothing once closed."""
+        """Show one moment. Does nothing after the viewer is closed."""
 
     def is_running(self) -> bool:
-        """False once the user closed it."""
+        """False after the user has closed the viewer."""
         ...
 
     def close(self) -> None:
-        """Free all that is held; again is allowed."""
+        """Free all resources. May be called twice."""
 
 
 def velocity_columns(table: Sequence[Command]) -> dict[int, int]:
-    """Column of the command -> column of the velocity (vx, vy, yaw rate), for the commands that are velocities."""
+    """For each velocity command: column of the command -> column of the velocity (vx, vy, yaw rate)."""
     return {column: VELOCITY.index(command.name) for column, command in enumerate(table) if command.name in VELOCITY}
 
 
 def top_speed(table: Sequence[Command]) -> float:
-    """The fastest [m/s] along one axis that the commands allow; 1 if none is a velocity."""
+    """The largest commanded speed [m/s] along one axis; 1 without velocity commands."""
     ends = [abs(end) for command in table if command.name in VELOCITY[:2] for end in (command.low, command.high)]
     return max(ends, default=0.0) or 1.0
 
 
 def target_velocity(table: Sequence[Command], commands: FloatArray) -> FloatArray:
-    """Commanded vx, vy, yaw rate (N, 3) out of `commands` (N, C); NaN where there is no such command."""
+    """Commanded vx, vy, yaw rate (N, 3) from `commands` (N, C); NaN for a missing command."""
     target = np.full((len(commands), len(VELOCITY)), np.nan)
     for column, component in velocity_columns(table).items():
         target[:, component] = commands[:, column]

@@ -1,6 +1,6 @@
-"""Our plugin of MuJoCo Studio's web viewer, run on its thread: the panel, the camera and the extra geoms of each picture.
+"""Our plugin for MuJoCo Studio's web viewer: the panel, the camera and the extra geoms of each picture.
 
-Import it only where a page is asked for: a mujoco without Studio cannot import it.
+It runs on the viewer's thread. Import it only to open a page: the import fails if mujoco lacks Studio.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -27,11 +27,11 @@ from legged_mw.view.stage import Moment
 
 
 class StudioPlugin(plugin.ViewerPlugin):
-    """An exception in a handler would end the session, so it is printed once, and the session goes on."""
+    """The plugin. An exception in a handler would end the session, so it is printed once and the session continues."""
 
     def __init__(self, robots: PosedRobots, pilot: Pilot, title: str) -> None:
         self.robots = robots
-        self.lock = threading.Lock()  # of the robots' poses
+        self.lock = threading.Lock()  # guards the robots' poses
         self.panel = Panel(pilot, title, dear_imgui, implot)
         self.begun = threading.Event()
         self._printed: set[str] = set()
@@ -39,7 +39,7 @@ class StudioPlugin(plugin.ViewerPlugin):
         self._camera: RobotCamera | None = None
 
     def show(self, moment: Moment) -> None:
-        """Show this moment from now on. The session's thread calls it."""
+        """Set the moment to show. Called by the session's thread."""
         self.panel.show(moment)
 
     @messages.handler
@@ -48,7 +48,7 @@ class StudioPlugin(plugin.ViewerPlugin):
 
     @messages.handler
     def on_model(self, event: messages.PostModelEvent) -> None:
-        if event.model.nbody < 2:  # the first one is empty
+        if event.model.nbody < 2:  # the first model is empty
             return
         show_groups(self.viewer.vis_options)
         self._scene = mujoco.MjvScene(event.model, state_payload.MAX_EXTRA_GEOMS)

@@ -1,4 +1,4 @@
-"""Frames into files: an MP4 or GIF through PyAV, a contact sheet, a PNG. Knows nothing of robots."""
+"""Write frames to files: MP4 or GIF with PyAV, a contact sheet, a PNG. Independent of robots."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from legged_mw.view.stage import ViewError
 Frame = NDArray[np.uint8]  # (height, width, 3)
 
 CODECS = {".mp4": "libx264", ".gif": "gif"}
-CRF = 20  # ours: x264's constant quality; 23 is its default and smears a dark checker floor
-DITHER = "dither=bayer:bayer_scale=4:diff_mode=rectangle"  # stands still where the picture does: small files
+CRF = 20  # ours: constant quality of x264; its default 23 smears a dark checker floor
+DITHER = "dither=bayer:bayer_scale=4:diff_mode=rectangle"  # constant where the picture is constant: small files
 
 
 class VideoWriter:
-    """H.264 in an MP4 that browsers play, or a GIF, by the name's ending. The file gets its name at `close`, when it is whole.
+    """Writes an MP4 (H.264 that browsers play) or a GIF, by the file's suffix. The file appears at `close`.
 
-    A GIF has one palette for all its frames, so they stay in memory until `close`.
+    A GIF has one palette for all frames, so the frames stay in memory until `close`.
     """
 
     def __init__(self, path: Path | str, width: int, height: int, fps: float) -> None:
@@ -61,7 +61,7 @@ class VideoWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """Finish the file and give it its name; again is allowed."""
+        """Finish the file and rename it to its final name. May be called twice."""
         if self._container is None:
             return
         if self.frames == 0:
@@ -82,10 +82,10 @@ class VideoWriter:
         self._container = None
 
     def abort(self) -> None:
-        """Drop the file; an older one of this name stays."""
+        """Discard the file. An older file with this name stays."""
         container, self._container = self._container, None
         if container is not None:
-            with contextlib.suppress(Exception):  # it cannot be finished in any state
+            with contextlib.suppress(Exception):  # closing fails in some states
                 container.close()
         self._partial.unlink(missing_ok=True)
 
@@ -109,7 +109,7 @@ class VideoWriter:
         self._palette: Any = self._palette_graph() if gif else None
 
     def _palette_graph(self) -> Any:
-        """Filters that choose a palette from all frames, then paint every frame with it."""
+        """The filters that compute a palette from all frames and apply it to each frame."""
         graph = self._av.filter.Graph()
         source = graph.add_buffer(width=self.width, height=self.height, format="rgb24", time_base=self._time)
         split, palette, use, sink = (
@@ -129,15 +129,15 @@ class VideoWriter:
 
 
 def check_format(path: Path) -> None:
-    """ViewError if a file of this name cannot be written."""
+    """Raise ViewError if a file with this name cannot be written."""
     if path.suffix.lower() not in CODECS:
         raise ViewError(f"Cannot write {path.name!r}: the supported extensions are .mp4 (H.264) and .gif.")
 
 
 def no_encoder(kind: str = ".mp4") -> str | None:
-    """Why no video of this kind can be written here, or None."""
+    """The reason why this machine cannot write this kind of video, or None."""
     try:
-        import av  # an extra: large, and not needed for training
+        import av  # an optional dependency: large, and not needed for training
     except ImportError as error:
         return f'Videos are written by PyAV ({error}). Install it: pip install "legged_mw[video]"'
     if CODECS[kind] not in av.codecs_available:
@@ -148,7 +148,7 @@ def no_encoder(kind: str = ".mp4") -> str | None:
 
 
 def contact_sheet(frames: Sequence[Frame], columns: int) -> Frame:
-    """Frames of one shape side by side, row after row; an unfinished last row ends in black."""
+    """A picture of equally large frames in rows of `columns`. The rest of the last row is black."""
     if not frames or columns < 1:
         raise ValueError(
             f"A contact sheet needs frames and at least one column; got {len(frames)} frames, {columns} columns."
@@ -161,7 +161,7 @@ def contact_sheet(frames: Sequence[Frame], columns: int) -> Frame:
 
 
 def save_png(path: Path | str, frame: Frame) -> None:
-    """Write one frame as an RGB PNG. By hand: a robot's computer has neither Pillow nor PyAV."""
+    """Write one frame as an RGB PNG. Needs neither Pillow nor PyAV, which a robot's computer lacks."""
 
     def chunk(tag: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + tag + body + struct.pack(">I", zlib.crc32(tag + body))

@@ -1,7 +1,7 @@
-"""A web page: MuJoCo Studio's web viewer with our panel. This process serves it and loads nothing from the net.
+"""The web page: MuJoCo Studio's web viewer with our panel. This process serves it and loads nothing from the internet.
 
-The page is not encrypted, so it is bound to 127.0.0.1 unless another host is asked for; `ssh -L` reaches it from afar.
-`gate.py` says who may reach it. Studio is young: our only use of its undocumented parts is in `_bound_to` and `close`, and checked.
+The page is not encrypted, so by default it is bound to 127.0.0.1; use `ssh -L` to reach it from another machine.
+`gate.py` controls the access. Undocumented parts of Studio are used only in `_bound_to` and `close`, and checked there.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -31,7 +31,7 @@ START_SECONDS = 20.0
 
 
 def missing() -> str | None:
-    """Why no page can be served here; None if one can."""
+    """The reason why this machine cannot serve a page, or None."""
     try:
         from mujoco.studio import launch_web, web_viewer  # noqa: F401
     except ImportError as error:
@@ -40,9 +40,9 @@ def missing() -> str | None:
 
 
 class WebViewer:
-    """Serves the page at `url` until it is closed; one at a time in a process."""
+    """Serves the page at `url` until `close`. Only one at a time per process."""
 
-    _serving = ""  # the address of the one that is open
+    _serving = ""  # the address of the open page
 
     def __init__(
         self,
@@ -58,11 +58,11 @@ class WebViewer:
             raise ViewError(f"--viewer web: {reason}")
         from mujoco.studio import launch_web, viewer_protocol
 
-        from legged_mw.view.studio import StudioPlugin  # a mujoco without web viewer cannot import it
+        from legged_mw.view.studio import StudioPlugin  # the import fails if mujoco lacks the web viewer
 
         self.robots = PosedRobots(spec, count)
         port = free_port(host, port)
-        # Studio's client of NetImgui is a global of C++: a second one never ends its first picture
+        # Studio's NetImgui client is a C++ global: a second client never finishes its first picture
         if WebViewer._serving:
             raise ViewError(
                 f"--viewer web: this process serves {WebViewer._serving} already, and MuJoCo's web viewer can be there once: close it first"
@@ -74,7 +74,7 @@ class WebViewer:
             self._wait(host, port)
         self.url, self.port = gate.url(host), port
         WebViewer._serving = self.url.partition("?")[0]
-        atexit.register(self.close)  # an open one ends the process in a segmentation fault
+        atexit.register(self.close)  # an open page at exit is a segmentation fault
 
     def show(self, moment: Moment) -> None:
         """Send one moment to all browsers."""
@@ -85,24 +85,24 @@ class WebViewer:
             self._handle.sync(self.robots.model, self.robots.data)
 
     def is_running(self) -> bool:
-        """Until `close`: a closed page may be opened again."""
+        """True until `close`: the user may open a closed browser page again."""
         return bool(self._handle.is_running())
 
     def close(self) -> None:
-        """Stop serving; again is allowed. Afterwards this process may serve another page."""
+        """Stop serving. May be called twice. Afterwards this process may serve another page."""
         atexit.unregister(self.close)
         try:
             self._handle.close()
         finally:
             viewer, self._plugin.viewer = self._plugin._viewer, None
             if viewer is not None and not self._handle._is_alive_fn():
-                vars(viewer).pop("_headless_ui", None)  # its last reference: C++ lets go of what it has once a process
+                vars(viewer).pop("_headless_ui", None)  # the last reference: C++ frees its objects once per process
                 WebViewer._serving = ""
 
     def _wait(self, host: str, port: int) -> None:
-        """Wait until the page is served, and refuse any interface but the one asked for."""
+        """Wait until the page is served. Refuse any interface other than `host`."""
         until = time.monotonic() + START_SECONDS
-        # raises what its thread raised
+        # is_running raises the exception of the viewer's thread
         while not self._listens() and time.monotonic() < until and self._handle.is_running():
             time.sleep(0.02)
         if not self._listens():
@@ -116,7 +116,7 @@ class WebViewer:
             )
 
     def _listens(self) -> bool:
-        """Whether its server listens: one more thread, which starts after the viewer."""
+        """Whether the server listens. Its thread starts after the viewer."""
         return (
             self._plugin.begun.is_set()
             and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
@@ -125,7 +125,7 @@ class WebViewer:
 
 @contextmanager
 def _bound_to(host: str, gate: Gate) -> Iterator[None]:
-    """While Studio starts, bind its socket to `host`, which it has no setting for, and put `gate` before it. Its log is quieter too."""
+    """While Studio starts: bind its socket to `host`, for which it has no setting, add `gate`, and reduce its log."""
     from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
@@ -136,9 +136,9 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
             f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host} and guarded"
         )
     logging.getLogger("WebServer").setLevel(logging.WARNING)
-    web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # its banner names all interfaces
+    web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # Studio's banner would name all interfaces
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
-    web_server.bind_loopback_socket = OwnSocket  # between its page's server and its panel, both in this process
+    web_server.bind_loopback_socket = OwnSocket  # the link from the page's server to the panel, both in this process
     web_server.serve = lambda handler, **settings: serve(handler, **_guarded(settings, gate))
     try:
         yield
@@ -148,7 +148,7 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
 
 
 def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
-    """The settings of Studio's server, with `gate` before each request and bounds on what a browser sends."""
+    """The settings of Studio's server, with `gate` before each request and limits on a browser's messages."""
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
@@ -178,8 +178,8 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
 
 
 def free_port(host: str, port: int = 0) -> int:
-    """`port` if it is free; for 0 the first free one from FIRST_PORT on. Raises ViewError."""
-    if not host:  # to a socket that is every interface
+    """`port` if it is free; for 0 the first free port from FIRST_PORT on. Raises ViewError."""
+    if not host:  # an empty host would mean all interfaces
         raise ViewError(
             f"--host is empty; leave it out for {LOCAL}, this machine alone, or name an interface (0.0.0.0: all)"
         )
@@ -208,9 +208,9 @@ def free_port(host: str, port: int = 0) -> int:
 
 
 def tunnel_line(port: int) -> str:
-    """The command that brings this machine's page to the user's own machine."""
+    """The ssh command that forwards the page to the user's machine."""
     user = getpass.getuser()
-    # client's address and port, then ours as the client knows them
+    # SSH_CONNECTION: the client's address and port, then ours as the client sees them
     client = os.environ.get("SSH_CONNECTION", "").split()
     if len(client) == 4:
         way = f"-p {client[3]} " if client[3] != "22" else ""
