@@ -5,8 +5,6 @@ python benchmarks/odometry.py go1_flat --noise      # the same with the noise of
 python benchmarks/odometry.py go1_rough --stairs    # six seconds outwards from the middle of each square of terrain.mjz
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import argparse

@@ -17,8 +17,6 @@ that setting (without ``--load_run``: random actions). Then:
 Penetration and slip are computed by C MuJoCo from positions and velocities alone, for both engines alike.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import argparse

@@ -9,8 +9,6 @@ that no run before this one compiled are in it. Contacts and rows are of the fir
 "wild" are those that the height field pushes more than 1 mm deeper than they are, as our kernel has it, "lost" those that it lets through.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import argparse

@@ -3,8 +3,6 @@
 python benchmarks/terrain_picture.py terrain.png --task go1_rough
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

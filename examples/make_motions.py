@@ -8,8 +8,6 @@ of mass follows from where the ground pushes, as of an inverted pendulum: z'' = 
 of mass and pelvis, frame by frame, by damped least squares.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import sys

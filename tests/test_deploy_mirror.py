@@ -1,7 +1,5 @@
 """A driven robot in a viewer: what is sent, what is shown, the button that damps, and the viewer's process."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import argparse

@@ -1,7 +1,5 @@
 """Leg odometry: what a leg says of the body's velocity, against MuJoCo; a walk on the estimate; who may ask for it."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import sys

@@ -3,8 +3,6 @@
 MUJOCO_GL=egl python -m website.film               # the README's film; website/gallery.py makes the gallery's
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 The export writes it from here, and ``legged_mw.deploy`` reads it. This module steps no physics and runs no network.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

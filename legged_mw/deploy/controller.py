@@ -1,7 +1,5 @@
 """The controller of an exported policy: measurement and command in, servo targets out. No robot, no clock."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

@@ -3,8 +3,6 @@
 A step is in the order of the environment's exams, so both give one result: sample, decide, push, move, check falls.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

@@ -6,8 +6,6 @@ Angles come from the motors' encoders. They look right if a motor is plugged in 
 encoder. For legs, the tilt of a freely hanging body then shows the direction; otherwise only a watching person can.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence

@@ -4,8 +4,6 @@ A separate process draws, so the view delays no step; closing it stops nothing. 
 close without notice. The robot's place in the view is integrated from its velocity, if known.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import argparse

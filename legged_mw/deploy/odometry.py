@@ -7,8 +7,6 @@ and one number is the variance of all three axes. Ours: a foot that disagrees wi
 slips or just touches down (Cauchy's weight). Nothing here depends on a robot class or a policy.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from dataclasses import replace

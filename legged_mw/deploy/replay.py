@@ -4,8 +4,6 @@ The simulation starts where the policy began on the robot: same joints, tilt and
 clipped as the robot's were.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

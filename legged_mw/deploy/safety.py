@@ -3,8 +3,6 @@
 The caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

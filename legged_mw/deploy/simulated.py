@@ -6,8 +6,6 @@ Torque and acceleration need forces, so they are one physics step old, as in tra
 In training, contact was one step old, too.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

@@ -1,7 +1,5 @@
 """Add sky, light, camera and terrain colours to the spec of a robot, for drawing only."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 For drawing only; the simulation does not change. The looks of the plane are in scene.py.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

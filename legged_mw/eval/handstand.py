@@ -3,8 +3,6 @@
 Needs only numpy and MuJoCo.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Each kind of exam is a ``Skill``. The same object judges the training environmen
 numpy and MuJoCo, but neither torch nor warp.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

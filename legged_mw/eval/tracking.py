@@ -1,7 +1,5 @@
 """The exam of motion tracking: follow the whole first clip from its start, with and without pushes."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Sensors and a keyframe are added here, meshes from files are written out; what i
 checked.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import re

@@ -1,7 +1,5 @@
 """Read motions of other programs: Unitree-style CSV, and the .npz of BeyondMimic and mjlab."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Mapping

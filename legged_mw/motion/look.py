@@ -1,7 +1,5 @@
 """Check a clip on a robot, and play it as a stage in the viewers."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ sideways axis are assumed to be hip and knee, and the leg to be straight with bo
 the sole level.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

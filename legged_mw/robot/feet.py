@@ -1,7 +1,5 @@
 """Guess a robot's feet: the lowest bodies without children, and bodies of the same family on other legs."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from typing import NamedTuple

@@ -10,8 +10,6 @@ the sign of the velocity in every substep: the joint rings. The integrator impli
 damping: any d is stable, and s < 4 + 2 d.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import copy

@@ -1,7 +1,5 @@
 """Missing or unreadable meshes and textures: drop those of visuals, raise an error for those of the physics."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Mapping

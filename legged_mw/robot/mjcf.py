@@ -5,8 +5,6 @@ encoding or malformed XML cannot have one meaning here and another in MuJoCo. An
 without the file's name.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import io

@@ -1,7 +1,5 @@
 """Write a first task: NAME.xml, the robot alone, and NAME_flat.py, a config that is ready for training."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import json

@@ -3,8 +3,6 @@
 The names stand in columns beside the robot, with lines to their places, so the names of 29 joints are readable.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

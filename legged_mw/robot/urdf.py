@@ -1,7 +1,5 @@
 """Prepare a URDF for MuJoCo's reader: find mesh files, drop unreadable visuals, keep links without mass massless."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from contextlib import suppress

@@ -3,8 +3,6 @@
 ``RobotFile.notes`` lists dropped, added and renamed elements. Runs on the host only, without simulation.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import re

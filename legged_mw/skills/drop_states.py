@@ -3,8 +3,6 @@
 The same seed gives the same states on any machine, with any number of threads, for any engine.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import copy

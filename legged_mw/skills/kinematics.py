@@ -3,8 +3,6 @@
 The engine's body poses lag one substep and are zero after a reset. These are current.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

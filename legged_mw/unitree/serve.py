@@ -4,8 +4,6 @@ Each step of 2 ms sends a state, takes the newest command and applies tau + kp (
 Without a watchdog the last command holds forever, as on a robot.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

@@ -1,7 +1,5 @@
 """Moves an `MjvCamera`: follow a robot, stay behind it, or show all robots. It looks over hills."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

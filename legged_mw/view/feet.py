@@ -1,7 +1,5 @@
 """The contact patch of each foot, for any shape of its geoms. Needs numpy and a posed model; draws nothing."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

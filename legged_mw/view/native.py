@@ -1,7 +1,5 @@
 """MuJoCo's window: shows moments and passes keys to the pilot. MuJoCo runs it on a separate thread."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import os

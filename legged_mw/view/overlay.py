@@ -3,8 +3,6 @@
 Appends to a `mujoco.MjvScene`. Opens no window, no file and no OpenGL context.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

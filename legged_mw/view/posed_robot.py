@@ -1,7 +1,5 @@
 """Robots posed by `qpos`, and the ground below them: kinematics only. Opens no window, no file, no OpenGL context."""
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

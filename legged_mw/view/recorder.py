@@ -3,8 +3,6 @@
 `MUJOCO_GL` must be set before mujoco is imported. The package does that.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import os

@@ -4,8 +4,6 @@ A stage is the training environment or another physics; a viewer is a window, a 
 other: `session.py` steps the stage and passes moments to the viewer. In `view/` only `env_stage.py` imports torch.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -4,7 +4,7 @@ It runs on the viewer's thread. Import it only to open a page: the import fails 
 """
 
 # pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
+# (parts of mujoco.studio that its own types do not name)
 from __future__ import annotations
 
 import sys

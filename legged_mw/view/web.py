@@ -5,7 +5,7 @@ The page is not encrypted, so by default it is bound to 127.0.0.1; use `ssh -L` 
 """
 
 # pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
+# (parts of mujoco.studio that its own types do not name)
 from __future__ import annotations
 
 import atexit
