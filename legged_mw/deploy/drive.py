@@ -126,12 +126,13 @@ def drive(
         checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
         states = checked or States(controller, sources, command, console.say)
         stack.callback(states.close)
-        console.say(f"{CHECK_KEYS if args.check_joints else KEYS}\n{states.state}: {states.note}")
-        stack.enter_context(_ended_by_signals())
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None
         # last, so that a refused run leaves no log
         log = Log(path, contract, folder, kind, console.say) if path else None
+        console.say(f"{CHECK_KEYS if args.check_joints else KEYS}\n{states.state}: {states.note}")
+        # right before the run, which ends damped at any of them
+        stack.enter_context(_ended_by_signals())
 
         def show(now: float, measured: Measurement | None) -> None:
             console.show(now, states)

@@ -68,10 +68,11 @@ def run(
     with ExitStack() as stack:
         for each in filter(None, (states, log)):
             stack.callback(each.close)
-        loop = stack.enter_context(Loop(controller.contract.period, live))
-        stack.enter_context(robot)
-        controller.reset()
+        loop = Loop(controller.contract.period, live)
         with suppress(*([KeyboardInterrupt] if states else [])):  # Ctrl-C is the normal end of a run with states
+            stack.enter_context(loop)
+            stack.enter_context(robot)
+            controller.reset()
             for now in loop.ticks(seconds):
                 measured = one.take(loop)
                 if one.over:

@@ -64,7 +64,7 @@ class LeggedRobot(RobotTask):
 
     def _end_step(self) -> None:
         super()._end_step()
-        if "last_foot_vel_z" in vars(self):
+        if "feet_impact_vel" in self.reward_names:
             self.last_foot_vel_z.copy_(self.foot_vel[..., 2])
         self.feet_air_time.masked_fill_(self.foot_contact, 0.0)
         self.swing_peak.masked_fill_(self.foot_contact, 0.0)

@@ -142,9 +142,9 @@ def _written(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Iterator
 
 
 def alike(expected: Tensor, value: Tensor, close: float, strays: float) -> bool:
-    """Equal to ``close``, relative and absolute, but for a share of ``strays``; fewer than 100 values each to a hundredth.
+    """Equal to ``close``, relative and absolute, but for a share of ``strays``.
 
-    Reads the device.
+    Fewer than 100 values must each be equal to a hundredth. Reads the device.
     """
     few = value.numel() < 100
     if few:

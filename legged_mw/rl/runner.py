@@ -84,8 +84,9 @@ class Runner(OnPolicyRunner):
         # policy -> figures, which are logged: called every `exam_interval` iterations and after the last
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
-        threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores())
-        self.update_threads = threads if device == "cpu" else nullcontext()
+        self.update_threads = nullcontext()
+        if device == "cpu":
+            self.update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores())
         self.console = Console()
         self._warned_overflow = self._curves_lost = False
         self._last_means: dict[str, float] = {}
