@@ -10,6 +10,7 @@ compared with the operations that it replaces, on the data of a real step.
 from __future__ import annotations
 
 import heapq
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any
@@ -18,7 +19,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged_mw.fast.fused_code import ADD_ROWS, Writer
+from legged_mw.fast.fused_code import ADD_ROWS, ASSIGN, Writer
 from legged_mw.fast.fused_memory import HELPERS, TYPES, Access, Code, Unfit
 from legged_mw.fast.trace import Call, Node, Trace, alike
 
@@ -98,7 +99,7 @@ class Region:
 
     def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace, device: str, there: set[int]) -> None:
         """``there``: blocks of memory that exist before the step."""
-        self.nodes = _join_sums(nodes)
+        self.nodes = _join(nodes, trace.watched)
         self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace, device))
         written = {view.block for node in self.nodes for view in node.writes} & there
         self._written = [_whole(trace.blocks[block]) for block in sorted(written)]
@@ -239,31 +240,46 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> 
             yield Kernel(together, worlds)
 
 
-def _join_sums(nodes: Sequence[Node]) -> list[Node]:
-    """Join a sum over worlds and its addition to a fixed tensor into one node, if the sum has no other reader."""
+def _join(nodes: Sequence[Node], watched: set[int]) -> list[Node]:
+    """Join pairs of operations that can be written as one, if nobody else reads what the first gives.
+
+    Blocks that are ``watched`` stay torch's to write.
+    """
+    readers = Counter(view.block for node in nodes for view in node.reads)
     joined = list[Node]()
     for node in nodes:
-        total = joined[-1] if joined else node
-        if (
-            node.name == "add"
-            and total.name == "sum"
-            and node.func._schema.is_mutable
-            and not node.kwargs
-            and len(node.args) == 2
-        ):
-            rows, dims = total.args[0], [*total.args[1]] if len(total.args) > 1 and total.args[1] else []
-            over_worlds = len(total.args) < 3 and (dims == [0] or (not dims and rows.dim() == 1))
-            unread = sum(view.block == total.writes[0].block for each in nodes for view in each.reads) == 1
-            if (
-                unread
-                and over_worlds
-                and node.args[1] is total.outs[0]
-                and total.writes[0].shape == node.writes[0].shape
-            ):
-                joined[-1] = Node(ADD_ROWS, (node.args[0], rows), {}, (), (total.reads[0], node.writes[0]), node.writes)
-                continue
-        joined.append(node)
+        pair = None
+        if joined and readers[joined[-1].writes[0].block] == 1 and node.writes[0].block not in watched:
+            pair = _sum_over_worlds(joined[-1], node) or _assignment(joined[-1], node)
+        if pair:
+            joined.pop()
+        joined.append(pair or node)
     return joined
+
+
+def _sum_over_worlds(total: Node, node: Node) -> Node | None:
+    """``to.add_(rows.sum(dim=0))``: a sum over worlds and its addition to a fixed tensor."""
+    if (total.name, node.name) != ("sum", "add") or not node.func._schema.is_mutable or node.kwargs:
+        return None
+    rows, dims = total.args[0], [*total.args[1]] if len(total.args) > 1 and total.args[1] else []
+    over_worlds = len(total.args) < 3 and (dims == [0] or (not dims and rows.dim() == 1))
+    if len(node.args) != 2 or node.args[1] is not total.outs[0] or not over_worlds:
+        return None
+    if total.writes[0].shape != node.writes[0].shape:
+        return None
+    return Node(ADD_ROWS, (node.args[0], rows), {}, (), (total.reads[0], node.writes[0]), node.writes)
+
+
+def _assignment(chosen: Node, node: Node) -> Node | None:
+    """``to.copy_(torch.where(mask, value, to))``."""
+    if (chosen.name, node.name) != ("where", "copy") or len(chosen.args) != 3 or len(node.args) != 2:
+        return None
+    (mask, value, kept), (to, source) = chosen.args, node.args
+    if source is not chosen.outs[0] or not isinstance(kept, Tensor) or kept.dtype != source.dtype != to.dtype:
+        return None
+    if (kept.data_ptr(), kept.shape, kept.stride()) != (to.data_ptr(), to.shape, to.stride()):
+        return None
+    return Node(ASSIGN, (to, mask, value), {}, (), chosen.reads, node.writes)
 
 
 def _code(node: Node, worlds: int, trace: Trace, device: str) -> Code | None:
@@ -352,8 +368,8 @@ class _Rows:
 
 def _replay(node: Node) -> None:
     """Run the node again on the same memory."""
-    if node.func is ADD_ROWS:
-        ADD_ROWS(*node.args)
+    if node.func in (ADD_ROWS, ASSIGN):
+        node.func(*node.args)
     elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like) and not node.kwargs.get(
         "generator"
     ):

@@ -19,17 +19,28 @@ from legged_mw.fast.trace import Node
 SMALL = 64  # elements of a shared value up to which each thread computes it for itself
 
 
-class _AddRows:
-    """Stands for ``to.add_(rows.sum(dim=0))``, two operations of torch."""
+class _Joined:
+    """Stands for two operations of torch that are written as one."""
 
     tags = ()
     overloadpacket = None
+
+
+class _AddRows(_Joined):
+    """``to.add_(rows.sum(dim=0))``."""
 
     def __call__(self, to: Tensor, rows: Tensor) -> Tensor:
         return to.add_(rows.sum(dim=0))
 
 
-ADD_ROWS = _AddRows()
+class _Assign(_Joined):
+    """``to.copy_(torch.where(mask, value, to))``: of what ``mask`` leaves alone nothing is read or written."""
+
+    def __call__(self, to: Tensor, mask: Tensor, value: Tensor) -> Tensor:
+        return to.copy_(torch.where(mask, value, to))
+
+
+ADD_ROWS, ASSIGN = _AddRows(), _Assign()
 
 
 _ONE = {  # name -> C of a unary operation on a
@@ -56,7 +67,7 @@ _TWO = {  # of a binary operation on a and b
     "or": "{a} | {b}", "xor": "{a} ^ {b}", "iand": "{a} & {b}", "ior": "{a} | {b}",
 }  # fmt: skip
 _THREE = {
-    "where": "({a} ? {b} : {c})", "masked_fill": "({b} ? {c} : {a})",
+    "where": "({a} ? {b} : {c})",
     "addcmul": "{a} + {s} * {b} * {c}", "addcdiv": "{a} + {s} * {b} / {c}",
     "lerp": "({c} < 0.5f ? {a} + {c} * ({b} - {a}) : {b} - ({b} - {a}) * (1.0f - {c}))",
 }  # fmt: skip
@@ -88,6 +99,8 @@ class Writer(Lines):
         self._out, self._reads = out, list[Access]()
         if name.startswith("empty") or name.startswith("new_empty"):
             lines = []
+        elif node.func is ASSIGN:
+            lines = self._assign(*node.args)
         elif name in _REDUCTIONS:
             lines = self._reduce(node, name)
         elif special := getattr(self, f"_emit_{name}", None):
@@ -147,7 +160,7 @@ class Writer(Lines):
             both = args[0].dtype if len(args) == 1 else torch.result_type(args[0], args[1])
             return [both] * len(args)
         out = self._out.dtype
-        return {"where": [torch.bool, out, out], "masked_fill": [out, torch.bool, out]}.get(name, [out] * len(args))
+        return [torch.bool, out, out] if name == "where" else [out] * len(args)
 
     def _value(self, value: Any, shape: Sequence[int], index: Sequence[str], kind: torch.dtype) -> str:
         """An operand as C: an element of a tensor, or a number, in the type ``kind``."""
@@ -174,6 +187,27 @@ class Writer(Lines):
                 limit = self._value(bound, shape, index, kind)
                 value = f"({value} {macro} {limit} ? {limit} : {value})"
         return self._store(shape, index, value, [v for v in (x, low, high) if isinstance(v, Tensor)])
+
+    def _assign(self, to: Tensor, mask: Tensor, value: Any) -> list[str]:
+        """Write ``value`` into the elements of ``to`` where ``mask`` is true; the others are not touched."""
+        view, shape, index = self._view(to), self._out.shape, self._index(self._out.shape)
+        if view != self._out or mask.dtype != torch.bool:
+            raise Unfit
+        others = [self._view(tensor) for tensor in (mask, value) if isinstance(tensor, Tensor)]
+        if any(other.block == view.block for other in others):
+            raise Unfit
+        chosen, new = self._read(mask, shape, index), self._value(value, shape, index, view.dtype)
+        store = f"{self._write(index)} = ({TYPES[view.dtype]})({new});"
+        if math.prod(mask.shape) == self._worlds:  # one value a world: the loop is left out
+            return [f"if ({chosen}) {{", *self._loops(shape, index, [store]), "}"]
+        return self._loops(shape, index, [f"if ({chosen}) {store}"])
+
+    def _emit_masked_fill(self, x: Tensor, mask: Tensor, value: Any) -> list[str]:
+        if self._view(x) == self._out and not self._shared:
+            return self._assign(x, mask, value)
+        shape, index, kind = self._out.shape, self._index(self._out.shape), self._out.dtype
+        kept, chosen = self._value(x, shape, index, kind), self._value(mask, shape, index, torch.bool)
+        return self._store(shape, index, f"({chosen} ? {self._value(value, shape, index, kind)} : {kept})", [x, mask])
 
     def _emit_pow(self, x: Tensor, exponent: Any) -> list[str]:
         if isinstance(exponent, Tensor) or self._out.dtype != torch.float32 or not isinstance(x, Tensor):
