@@ -10,6 +10,7 @@ compared with the operations that it replaces, on the data of a real step.
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -27,7 +28,8 @@ if wp.config.log_level < wp.LOG_WARNING:  # MuJoCo's engine steps: keep warp fro
     wp.config.log_level = wp.LOG_ERROR
 
 BLOCK, LANES = 32, 8  # threads a block, threads a world: 4096 worlds fill a large GPU
-_ROOM = 44_000 * LANES // BLOCK  # bytes of shared memory for the temporaries of one world
+_WIDE, _RESIDENT = 64, 2**18  # an operation on more values takes 32 lanes, where a large GPU holds them all at once
+_ROOM = 5_500  # bytes of shared memory for the temporaries of one world
 _CLOSE = 1e-4  # relative and absolute tolerance: float32 rounding over a few operations
 _STRAYS = 0.002  # share of elements that may differ more, where rounding flipped a comparison
 
@@ -42,7 +44,7 @@ class Kernel:
         """Generate the source. Blocks in ``own`` are temporaries of this kernel, in shared memory if they fit."""
         used = dict.fromkeys(view.block for node in self.nodes for view in (*node.reads, *node.writes))
         self._device = str(trace.blocks[next(iter(used))].device)
-        self._lanes = 1 if self._device == "cpu" else LANES
+        self._lanes = 1 if self._device == "cpu" else self._lanes_of_gpu()
         sizes = {block: self._size(trace.blocks[block]) for block in used if block in own}
         room, kept = _ROOM, dict[int, int]()
         for block in sorted(sizes, key=sizes.__getitem__):
@@ -63,6 +65,11 @@ class Kernel:
             lines += writer.emit(node).lines
         self._source = "\n".join(lines)
         self._kernel = _kernel_of(wp.func_native(self._source)(_body))
+
+    def _lanes_of_gpu(self) -> int:
+        """Threads a world: 8 for many short operations in a row, 32 for wide ones."""
+        widest = max(math.prod(view.shape[1:]) for node in self.nodes for view in node.writes)
+        return BLOCK if widest > _WIDE and self._worlds * BLOCK <= _RESIDENT else LANES
 
     def _size(self, tensor: Tensor) -> int:
         """Elements of one world's part of a tensor, or of a whole tensor that all worlds share."""

@@ -25,7 +25,7 @@ HELPERS = """
 #define SYNC __syncwarp(lanes);
 #define ADD(to, x) atomicAdd(&(to), x)
 #define OWN(type, name, n) __shared__ type all_##name[BLOCK / LANES][n]; type* name = all_##name[threadIdx.x / LANES];
-const unsigned lanes = ((1u << LANES) - 1u) << (threadIdx.x % 32 / LANES * LANES);  // of this world
+const unsigned lanes = (~0u >> (32 - LANES)) << (threadIdx.x % 32 / LANES * LANES);  // of this world
 #else
 #define SYNC
 #define ADD(to, x) (to) += (x)

@@ -12,9 +12,11 @@ from torch import Tensor
 from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.fast.fused import Fused, Kernel, Region
+from legged_mw.fast.fused_code import ASSIGN
 from legged_mw.fast.step_compiler import fused as fuse
 from legged_mw.fast.step_compiler import fused_step, remember
 from legged_mw.fast.trace import Trace
+from legged_mw.utils.math import assign
 from legged_mw.utils.opaque import not_traced, tracing
 from legged_mw.utils.task import load_task
 
@@ -92,7 +94,18 @@ def shared(m: Memory) -> None:
     m.one.copy_(m.out[:, 0] - m.sums[0])
 
 
-STEPS = {"arithmetic": arithmetic, "reductions": reductions, "places": places, "shared": shared}
+def masked(m: Memory) -> None:
+    assign(m.wide[:, 1], m.flags[:, 0], m.quat[:, 0])
+    m.a.copy_(torch.where(m.flags, m.row, m.a))
+    m.b[:, 1:].copy_(torch.where(m.flags[:, :1], m.b[:, :-1], m.b[:, 1:]))  # a value of the same memory
+    m.count.masked_fill_(m.flags[:, 1], 3)
+    m.quat[:, 0].copy_(torch.where(m.flags[:, :1], m.quat[:, 0], m.quat[:, 1]))  # no assignment: all is written
+    chosen = torch.where(m.flags[:, 2:3], 1.0, m.history[:, 0])
+    m.history[:, 0].copy_(chosen)
+    m.one.copy_(chosen.sum(dim=1))  # what was chosen is read twice
+
+
+STEPS = {"arithmetic": arithmetic, "reductions": reductions, "places": places, "shared": shared, "masked": masked}
 
 
 @pytest.mark.parametrize("name", STEPS)
@@ -153,6 +166,17 @@ def test_random_numbers_are_those_of_the_step_as_it_is() -> None:
         run()
     for name in ("out", "one", "b"):
         torch.testing.assert_close(getattr(kept[0], name), getattr(kept[1], name))
+
+
+def test_an_assignment_is_one_operation() -> None:
+    """What it leaves alone is neither read nor written."""
+    m = Memory()
+    program = fused(lambda: assign(m.out, m.flags[:, 0], m.a))
+    assert [node.func for kernel in program.kernels for node in kernel.nodes] == [ASSIGN]
+    watched = Trace([m.out])
+    with watched:
+        assign(m.out, m.flags[:, 0], m.a)
+    assert left_to_torch(Fused(watched, N, "cpu")) == ["copy"]  # of a value that a kernel chose
 
 
 def test_a_sum_that_is_read_twice_is_a_sum() -> None:
