@@ -195,7 +195,8 @@ def test_the_program_does_not_say_that_it_logged(
         program.main()
     out = capsys.readouterr().out
     why = f"the log {path} ends after 0 steps: File too large"
-    assert out.splitlines().count(why) == 1 and f"the joints are damped; {why}\n" in out and "logged to" not in out
+    # once by the log's thread, perhaps within another line, and once at the end
+    assert out.count(why) == 2 and f"the joints are damped; {why}\n" in out and "logged to" not in out
 
 
 # ---- replay
