@@ -1,7 +1,7 @@
-"""The rules of the walking exam: its commands, measures and pass marks. Needs numpy, but neither torch nor warp.
+"""The walking exam: its commands, measures, pass marks and verdict. Needs numpy, but neither torch nor warp.
 
-``exam`` applies them in the training environment, ``legged_mw.deploy`` to an exported policy. A push is a jump of the
-base's velocity.
+``rollout`` applies it in the training environment, ``legged_mw.deploy`` to an exported policy. A push is a jump of
+the base's velocity.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from legged_mw.utils.commands import LABELS, VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command, and settling time at its start that is not measured
+EXAM_SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command, and settling time at its start that is not measured
 # [s] time of the first push; [s] time at which the robot must still stand; number of directions
 PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16
 GRAVITY = 9.81  # [m/s^2]
