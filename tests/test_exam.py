@@ -236,7 +236,7 @@ def test_an_older_name_of_the_peer_is_read() -> None:
         ({"push_speeds": [0.0, 2.0]}, "exam.push_speeds is [0.0, 2.0]; it must be one or more numbers above zero"),
         ({"push_speeds": [1.0]}, "exam.push_mark is 2; it must be one of exam.push_speeds, [1.0]"),
         ({"marks": [0.1]}, "exam.marks is [0.1]; it must be three numbers, or an empty list"),
-        ({"peer": "go11"}, "exam.peer: no robot 'go11' in legged_mw/eval/peers.py; did you mean 'go1'?"),
+        ({"peer": "go11"}, "exam.peer: no robot 'go11' in resources/peers.yaml; did you mean 'go1'?"),
     ],
 )
 def test_rules_that_cannot_be_applied(given: dict[str, Any], line: str) -> None:
@@ -262,7 +262,7 @@ def test_rules_of_an_export() -> None:
     ("section", "line"),
     [
         ({"push_speeds": 3.0}, "policy.yaml: exam: 'float' object is not iterable"),
-        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no robot 'nobody' in legged_mw/eval/peers.py"),
+        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no robot 'nobody' in resources/peers.yaml"),
     ],
 )
 def test_a_contract_with_another_section(section: dict[str, Any], line: str) -> None:

@@ -1,4 +1,4 @@
-"""docs/published_policies.md's tables hold the figures of eval/peers.py, and of the policies that ship."""
+"""docs/published_policies.md's tables hold the figures of resources/peers.yaml, and of the policies that ship."""
 
 from __future__ import annotations
 

@@ -170,9 +170,13 @@ def pages(both: tuple[dict[str, Any], ...], tmp_path_factory: pytest.TempPathFac
         "device": "cpu",
         "overrides": {"noise.level": 0.0},
     }
-    columns = [report.Column("<first>", about, result, figures), report.Column("rival", about, fallen, nothing)]
     other = {**result, "error": [value + 0.004 for value in result["error"]]}
-    report.write(folder, "go1_flat", columns, extras=[("by numpy", other)])
+    columns = [
+        Column("<first>", about, result, figures),
+        Column("by numpy", {}, other),
+        Column("rival", about, fallen, nothing),
+    ]
+    report.write(folder, "go1_flat", columns)
     return folder
 
 
@@ -312,9 +316,7 @@ def test_compare_grades_each_by_its_own_config(
     root, first, second = two_runs
     monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
     written: list[Any] = []
-    kind = exams.EXAMS["walking"]._replace(
-        write=lambda folder, task, columns, extras: written.extend([folder, task, *columns])
-    )
+    kind = exams.EXAMS["walking"]._replace(write=lambda folder, task, columns: written.extend([folder, task, *columns]))
     monkeypatch.setitem(exams.EXAMS, "walking", kind)
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]

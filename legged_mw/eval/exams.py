@@ -6,6 +6,7 @@ import argparse
 import copy
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
@@ -40,13 +41,15 @@ class Exam(NamedTuple):
     prepare: Callable[[LoadedTask], None]  # turns a task into the exam
     make_room: Callable[[LoadedTask], None]  # sets the number of worlds again, after the user's overrides
     ask_alike: Callable[[Sequence[LoadedTask]], None]  # grades all prepared tasks by the rules of the first
-    # (environment, policy) -> result, figures
-    examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]
+    # environment of the prepared task, policy -> result, figures
+    examine: Callable[[Any, Policy], tuple[dict[str, Any], dict[str, Any]]]
     rules: Callable[[LoadedTask], ExamRules | Skill]  # of a prepared task, also for another physics engine
     table: Callable[[dict[str, Any]], str]  # the result as text
-    write: Callable[..., None]  # the report: see report.write
+    write: Callable[[Path, str, Sequence[Column]], None]  # the report on a task's policies, into a folder
     in_training: Callable[[LoadedTask, str, bool], Examiner]  # task, device, eager
-    rough: ModuleType | None = None  # second part for rough terrain, with prepare, SETS, make_room and table
+    rough: ModuleType | None = (
+        None  # second part for rough terrain, with SETS, prepare, make_room, run_crossing and table
+    )
 
 
 def _skill(kind: str) -> Exam:
@@ -144,7 +147,8 @@ def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namesp
     writable(str(folder), "the report goes to", folder=True)
     built = [(each, *build(each, args, device)) for each in graded]  # an error must come before a long exam
     columns = [make_column(*each) for each in built]
-    graded[0].exam.write(folder, graded[0].task.name, columns, elsewhere(graded[0]))
+    columns[1:1] = [Column(name, {}, result) for name, result in elsewhere(graded[0])]
+    graded[0].exam.write(folder, graded[0].task.name, columns)
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 
 

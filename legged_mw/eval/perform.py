@@ -23,7 +23,7 @@ from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
 from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.errors import UserError
-from legged_mw.utils.task import LoadedTask, load_task
+from legged_mw.utils.task import LoadedTask
 
 NOMINAL: dict[str, Any] = {
     **{f"domain_rand.{name}": [] for name in KINDS},
@@ -151,18 +151,16 @@ class InTraining:
     """The first part of the exam during training. ``rollout.TrainingExam`` does the same for the walking exam."""
 
     def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
-        copied = load_task(str(task.path))
-        copied.update(task.to_dict(), where="training")
-        copied.exam = task.exam
+        copied = rollout.copy_of(task)
         prepare(copied)
-        self.skill, self._generators = skill_of(copied.cfg, copied.exam), [device] if device.startswith("cuda") else []
-        with torch.random.fork_rng(self._generators):
+        self.skill = skill_of(copied.cfg, copied.exam)
+        with rollout.keep_random_state(device):
             self.env = copied.env_class(copied.cfg, device, eager=eager)
         self._starts = self.skill.starts(machine(self.env), self.env.num_envs)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """The figures of ``first_part``."""
-        with torch.random.fork_rng(self._generators):
+        with rollout.keep_random_state(self.env.device):
             return first_part(self.env, policy, self.skill, self._starts)
 
 
@@ -184,11 +182,8 @@ def of_result(result: Mapping[str, Any]) -> Skill:
     )
 
 
-def write(
-    folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
-) -> None:
+def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     """Write ``report.json`` and ``report.html``; see ``report.write``."""
-    columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)
     content = {"task": task, "columns": [{**column._asdict(), "figures": None} for column in columns]}
     (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

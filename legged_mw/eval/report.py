@@ -56,7 +56,7 @@ class Column(NamedTuple):
     name: str
     about: dict[str, Any]  # policy, engine, device, overrides; a warning if contact buffers overflowed
     exam: dict[str, Any]  # the result of ``ExamRules.grade``
-    figures: dict[str, Any] | None = None  # None: exam result only
+    figures: dict[str, Any] | None = None  # None: exam result only, such as on another physics engine
 
 
 def walking_page(
@@ -77,13 +77,19 @@ def walking_page(
     )
     results = [column.exam for column in columns]
     figures = [rules.figures(result, others=results) for result in results]
+    header = f"""{_names(columns, rules)}{_cards(figures[0])}</header>
+<section><h2>Exam</h2><p class="lead">{note}</p>{exam_table(columns, figures, rules.peer_label)}</section>"""
+    published = _published(rules, columns) if len(rules.peers) > 1 else ""
+    return _page(task, "walking exam", "Walking exam", f"{header}\n{''.join(chapters)}{published}", columns)
+
+
+def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]) -> str:
+    """The frame of a page. ``body`` begins inside of the header, below the task's name, and closes it."""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>
+<meta name="color-scheme" content="light dark"><title>{escape(task)}: {escape(exam)}</title><style>{CSS}</style></head>
 <body><main>
-<header><p class="above">Walking exam</p><h1>{escape(task)}</h1>{_names(columns, rules)}{_cards(figures[0])}</header>
-<section><h2>Exam</h2><p class="lead">{note}</p>{exam_table(columns, figures, rules.peer_label)}</section>
-{"".join(chapters)}{_published(rules, columns) if len(rules.peers) > 1 else ""}
+<header><p class="above">{escape(above)}</p><h1>{escape(task)}</h1>{body}
 <footer>{about(columns)}</footer>
 </main></body></html>
 """
@@ -298,15 +304,8 @@ def skill_page(task: str, skill: Skill, columns: Sequence[Column], strips: Mappi
         figures = [skill.figures(column.exam["parts"], part) for column in columns]
         strip = picture(strips[part], part) if part in strips else ""
         sections.append(f"<section><h2>{escape(part)}</h2>{exam_table(columns, figures, '', 'asks')}{strip}</section>")
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark"><title>{escape(task)}: {escape(skill.kind)}</title><style>{CSS}</style></head>
-<body><main>
-<header><p class="above">Exam: {escape(skill.kind)}</p><h1>{escape(task)}</h1><ul class="names">{"".join(passed)}</ul></header>
-<p class="lead">{escape(skill.asks)}</p>{"".join(sections)}
-<footer>{about(columns)}</footer>
-</main></body></html>
-"""
+    header = f'<ul class="names">{"".join(passed)}</ul></header>\n<p class="lead">{escape(skill.asks)}</p>'
+    return _page(task, skill.kind, f"Exam: {skill.kind}", header + "".join(sections), columns)
 
 
 def picture(png: bytes, name: str) -> str:
@@ -317,18 +316,13 @@ def picture(png: bytes, name: str) -> str:
 # ---- files
 
 
-def write(
-    folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
-) -> None:
+def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     """Write ``report.json``, one PNG per section and the self-contained ``report.html``.
 
     Every column is compared with the first, by the rules of the first. At most two columns have figures.
-    ``extras``: further exam results by name, such as the first policy's on another physics engine. The exam's table
-    shows their gap to the first column.
     """
     from legged_mw.eval import plots  # matplotlib takes a second to import
 
-    columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)
     asked = ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column._asdict() for column in columns]}

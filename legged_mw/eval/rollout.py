@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -101,6 +102,11 @@ def roll_out(
         last_position=env.root_pos[:, :2].cpu().numpy().copy(),
         signals={name: values.cpu().numpy() for name, values in kept.items()},
     )
+
+
+def keep_random_state(device: str) -> AbstractContextManager[None]:
+    """Restore the state of the random generators at the end of the ``with`` block."""
+    return torch.random.fork_rng([device] if device.startswith("cuda") else [])
 
 
 class _Actor:
@@ -220,7 +226,7 @@ def grade(rules: ExamRules, record: Record) -> dict[str, Any]:
     )
 
 
-# ---- the report's cases: the exam's first, so that its result is the same, then further ones in the trained ranges
+# ---- the report's cases: those of the exam, then further ones. Commands stay in the trained ranges
 
 
 GRID = (13, 9, 9)  # number of values of vx, vy, yaw rate
@@ -241,7 +247,10 @@ class Plan(NamedTuple):
 
 
 def make_plan(cfg: LeggedRobotCfg, dt: float) -> Plan:
-    """All cases of a report on a policy that was trained with ``cfg``."""
+    """All cases of a report on a policy that was trained with ``cfg``.
+
+    The exam's worlds come first, so their result equals that of the exam alone.
+    """
     ranges = cfg.commands.ranges
     limits = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
     axes = [np.unique(np.linspace(low, high, n).round(3)).tolist() for (low, high), n in zip(limits, GRID, strict=True)]
@@ -370,11 +379,17 @@ def motor_limits(env: LeggedRobot) -> figures.MotorLimits:
 # ---- the short exam during training, in a separate environment
 
 
-TRAINING_SECONDS, TRAINING_SETTLING = (
-    4.0,
-    2.0,
-)  # [s] duration of the roll-out, and settling time at its start without error measurement
+TRAINING_SECONDS = 4.0  # [s] duration of the roll-out
+TRAINING_SETTLING = 2.0  # [s] at its start, without error measurement
 TRAINING_PUSH_AT = 1.0  # [s] time of the first of 16 pushes; a push is survived if the robot stands at the end
+
+
+def copy_of(task: LoadedTask) -> LoadedTask:
+    """The task as it is trained, with its overrides, to be turned into an exam."""
+    copy = load_task(str(task.path))
+    copy.update(task.to_dict(), where="training")
+    copy.exam = task.exam
+    return copy
 
 
 class TrainingExam:
@@ -385,13 +400,11 @@ class TrainingExam:
     """
 
     def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
-        copy = load_task(str(task.path))
-        copy.update(task.to_dict(), where="training")
+        copy = copy_of(task)
         rules = ExamRules.from_config(copy.cfg)
         self.rules = replace(rules, push_speeds=(rules.push_mark,), transport_vx=rules.ranges[0][1])  # one of the 22
         prepare(copy, self.rules.worlds())
-        self._generators = [device] if device.startswith("cuda") else []
-        with torch.random.fork_rng(self._generators):
+        with keep_random_state(device):
             self.env = copy.env_class(copy.cfg, device, eager=eager)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
@@ -400,7 +413,7 @@ class TrainingExam:
         For a policy with a velocity estimator also its RMS errors ``estimate_vx``, ``estimate_vy`` [m/s].
         """
         dt = self.env.dt
-        with torch.random.fork_rng(self._generators):
+        with keep_random_state(self.env.device):
             asked = cases(self.rules, dt, TRAINING_PUSH_AT)
             record = roll_out(self.env, policy, asked, round(TRAINING_SECONDS / dt), {"velocity": SIGNALS["velocity"]})
         return training_figures(record, len(self.rules.commands()))

@@ -71,7 +71,7 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
     assert env.tiles
     kinds = env.tiles.kinds
     repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds are sorted by kind, column, level
-    with torch.random.fork_rng([env.device] if env.device.startswith("cuda") else []):
+    with rollout.keep_random_state(env.device):
         torch.manual_seed(0)
         env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
         outcomes = _walk(env, policy, env.tiles.size / 2)

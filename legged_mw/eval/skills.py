@@ -73,6 +73,14 @@ class Recording(NamedTuple):
     torque: Floats  # (T, N, D) [N m], one simulation step old
     ended_at: Floats  # (N,) control step of the first end of an episode, or inf; later samples are of another one
 
+    def alive(self) -> NDArray[np.bool_]:
+        """(T, N): the first episode has not ended."""
+        return np.arange(len(self.qpos))[:, None] <= self.ended_at
+
+    def power(self) -> Floats:
+        """(T, N) [W]: the sum over the joints of |torque * speed|."""
+        return np.abs(self.torque * self.qvel[..., 6:]).sum(axis=2)
+
 
 class Measure(NamedTuple):
     """A figure of each part of an exam, with its pass marks on the task's own ground and on other grounds."""
@@ -209,7 +217,6 @@ class GetupExam(Skill):
         still = held[np.minimum(up_at + stay, len(held) - 1), np.arange(held.shape[1])] & up
         until = np.arange(len(recording.qpos))[:, None] <= up_at  # (T, N): still getting up
         seconds = np.where(up, up_at * robot.dt, np.inf)
-        power = np.abs(recording.torque * recording.qvel[..., 6:]).sum(axis=2)
         highest = np.where(robot.model.actuator_forcelimited, robot.model.actuator_forcerange[:, 1], np.inf)
         at_limit = (np.abs(recording.torque) >= AT_LIMIT * highest).mean(axis=2)
         return {
@@ -217,7 +224,7 @@ class GetupExam(Skill):
             "stays": float(still.mean()),
             "median": float(np.median(seconds[up])) if up.any() else None,
             "slowest": float(seconds[up].max()) if up.any() else None,
-            "energy": float((power * until).sum(axis=0)[up].mean() * robot.dt) if up.any() else None,
+            "energy": float((recording.power() * until).sum(axis=0)[up].mean() * robot.dt) if up.any() else None,
             "at_limit": float(at_limit[until].mean()),
             "worst": int(np.argmax(np.where(still, seconds, np.inf))),  # a robot that failed, else the slowest
         }
@@ -230,7 +237,7 @@ def standing(robot: ExamRobot, recording: Recording) -> np.ndarray:
     upright = -(axis @ gravity) > np.cos(np.radians(GETUP_TILT))
     high = recording.qpos[..., 2] > GETUP_HIGH * robot.home[2]
     slow = np.abs(recording.qvel[..., 6:]).mean(axis=2) < GETUP_SLOW
-    return high & upright & slow & (np.arange(len(high))[:, None] <= recording.ended_at)
+    return high & upright & slow & recording.alive()
 
 
 def _lasting(true: np.ndarray, steps: int) -> np.ndarray:
@@ -285,20 +292,18 @@ class HandstandExam(Skill):
         touching, hands = self._ground_contact(robot, recording.qpos)
         ahead = rotate(recording.qpos[..., 3:7], np.array([1.0, 0.0, 0.0]))  # the root's x axis in the world frame
         upright = self.nose * ahead[..., 2] > np.cos(np.radians(HANDSTAND_TILT))
-        alive = np.arange(len(touching))[:, None] <= recording.ended_at
-        up = upright & (recording.qpos[..., 2] > HANDSTAND_HIGH * self.height) & ~touching & alive  # (T, N)
+        up = upright & (recording.qpos[..., 2] > HANDSTAND_HIGH * self.height) & ~touching & recording.alive()  # (T, N)
         hold = round(HANDSTAND_HOLD / robot.dt)
-        held = np.asarray(np.lib.stride_tricks.sliding_window_view(up, hold, axis=0).all(axis=2))  # (T - hold + 1, N)
+        held = _lasting(up, hold)
         holds, begin = held.any(axis=0), held.argmax(axis=0)
         each = np.arange(len(recording.ended_at))
         drift = np.linalg.norm(hands[begin + hold - 1, each] - hands[begin, each], axis=1)
-        power = np.abs(recording.torque * recording.qvel[..., 6:]).sum(axis=2)  # (T, N)
         return {
             "holds": float(holds.mean()),
             "up": float(up.any(axis=0).mean()),
             "median": float(np.median(begin[holds]) * robot.dt) if holds.any() else None,
             "drift": float(drift[holds].mean()) if holds.any() else None,
-            "power": float(power[up].mean()) if up.any() else None,
+            "power": float(recording.power()[up].mean()) if up.any() else None,
             # a robot that failed, else the one that drifted most
             "worst": int(np.argmax(np.where(holds, drift, np.inf))),
         }
@@ -370,7 +375,7 @@ class TrackingExam(Skill):
 
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         assert robot.motion
-        motion, model, steps = robot.motion, robot.model, len(recording.qpos)
+        motion, model = robot.motion, robot.model
         bodies, anchor = [model.body(name).id for name in motion.bodies], motion.bodies.index(motion.anchor)
         wanted, wanted_turn = _posed(model, motion.qpos[:, None], bodies)  # (T, 1, B, 3), (T, 1, B, 4)
         found, turn = _posed(model, recording.qpos, bodies)
@@ -383,7 +388,7 @@ class TrackingExam(Skill):
         up = [1.0 - 2.0 * (q[..., 1] ** 2 + q[..., 2] ** 2) for q in (turn[:, :, anchor], wanted_turn[:, :, anchor])]
         away = np.abs(found - wanted)[:, :, anchor, 2]
         lost = ~((away <= LOST_HEIGHT) & (np.abs(up[0] - up[1]) <= LOST_TILT))  # NaN too
-        lost |= np.arange(steps)[:, None] > recording.ended_at
+        lost |= ~recording.alive()
         follows = ~np.maximum.accumulate(lost, axis=0)
         last, kept = follows[-1], follows.sum(axis=0)
         own = np.where(follows, error, 0.0).sum(axis=0) / np.maximum(kept, 1)
