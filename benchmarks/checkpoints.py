@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from legged_mw.eval import crossing, exam, perform
+from legged_mw.eval import perform, rollout, rough
 from legged_mw.eval.exams import require_exam
-from legged_mw.eval.rules import in_common
+from legged_mw.eval.walking import in_common
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.run_folder import CONFIG_FILE, checkpoints, task_of
 from legged_mw.rl.saved_config import update_from_run
@@ -45,7 +45,7 @@ def line(result: dict[str, Any]) -> str:
     """A result in a line, a crossing in its table."""
     start = f"{result['iteration']:>6} {result['seconds']:>7.1f} s"
     if "kinds" in result:
-        return f"{start}\n{crossing.table(result)}"
+        return f"{start}\n{rough.table(result)}"
     if "walks" not in result:
         return f"{start}  " + "  ".join(
             f"{name} {value:.3f}" for name, value in result.items() if name not in ("iteration", "seconds")
@@ -87,8 +87,8 @@ def main() -> None:
             perform.first_part, skill=perform.skill_of(task.cfg, task.exam)
         )
     else:
-        (crossing if args.crossing else exam).prepare(task)
-        grade = crossing.run_crossing if args.crossing else exam.run_exam
+        (rough if args.crossing else rollout).prepare(task)
+        grade = rough.run_crossing if args.crossing else rollout.run_exam
     found = [iteration for iteration in checkpoints(args.run) if iteration <= args.until]
     wanted = [iteration for iteration in found if iteration % args.every == 0 or iteration == found[-1]]
     results = graded(args.run, wanted, device, grade, task)

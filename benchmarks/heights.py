@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 
 from legged_mw import ROOT
-from legged_mw.eval import crossing
-from legged_mw.eval.rules import LEVELS
+from legged_mw.eval import rough
+from legged_mw.eval.walking import LEVELS
 from legged_mw.rl.policies import find_trained, load_policy
 from legged_mw.sim.terrain import MEASURES, measure
 from legged_mw.utils.cli import one_line_errors, pick_device, seed_everything
@@ -24,16 +24,16 @@ def shares(
     """What a policy is asked at ten heights, from ``low`` to ``high`` in the kind's unit, and the share of robots that cross."""
     trained = find_trained(asked, ROOT / "logs", "policy")
     task, (first, last) = trained.task, (measure(kind, difficulty)[1] for difficulty in (0.0, 1.0))
-    crossing.prepare(task)
+    rough.prepare(task)
     task.set("terrain.terrain_proportions", {kind: 1.0})
     task.set("terrain.difficulty", [(height - first) / (last - first) for height in (low, high)])
     task.set("sim.engine", engine)
-    crossing.make_room(task, repeats)
+    rough.make_room(task, repeats)
     seed_everything(1)
     env = task.env_class(task.cfg, device)
     policy = load_policy(trained.source.checkpoint, env, task.train, device)
     heights = [low + (high - low) * level / (LEVELS - 1) for level in range(LEVELS)]
-    return heights, crossing.run_crossing(env, policy)["kinds"][kind]["crossed"]
+    return heights, rough.run_crossing(env, policy)["kinds"][kind]["crossed"]
 
 
 @one_line_errors()
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--engine", choices=["auto", "mujoco", "mujoco_warp"], default="auto")
     parser.add_argument("--device")
     args = parser.parse_args()
-    (low, high), repeats = args.heights, max(args.robots // crossing.TILES, 1)
+    (low, high), repeats = args.heights, max(args.robots // rough.TILES, 1)
     heights, crossed = shares(args.policy, args.kind, low, high, repeats, args.engine, pick_device(args.device))
     print(f"{MEASURES[args.kind][0]:<14}" + "".join(f"{height:>7.4g}" for height in heights))
     print(f"{'crossed':<14}" + "".join(f"{share:>7.2f}" for share in crossed))

@@ -22,8 +22,8 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.eval import rules
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval import walking
+from legged_mw.eval.walking import ExamRules
 from legged_mw.unitree.client import Direct, UnitreeRobot
 from legged_mw.unitree.faults import Faults, parse_faults
 from legged_mw.unitree.link import RobotEnd, Wire
@@ -49,15 +49,15 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
     safety = Safety(contract, Limits.of(folder, contract))
     controller, names = Controller(folder, contract), [command.name for command in contract.commands]
     signals, fell_at, last = defaultdict(list), [], []
-    pushed = [(exam.push_vx, 0.0, 0.0)] * rules.PUSH_DIRECTIONS
+    pushed = [(exam.push_vx, 0.0, 0.0)] * walking.PUSH_DIRECTIONS
     for world, held in enumerate([*exam.held(), *pushed]):
         command = np.array([each.default for each in contract.commands])
-        command[[names.index(name) for name in rules.VELOCITY]] = held
+        command[[names.index(name) for name in walking.VELOCITY]] = held
         direction = world - len(exam.held())
         begin(sim, robot)
         controller.reset()
         one, fell = defaultdict(list), math.inf
-        for step in range(round(rules.SECONDS / contract.period)):
+        for step in range(round(walking.EXAM_SECONDS / contract.period)):
             velocity = [*sim._sensor("lin_vel")[:2], sim._sensor("ang_vel")[2]]
             values = (
                 velocity,
@@ -67,8 +67,8 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
             )
             for name, value in zip(("velocity", "position", "power", "joint_speed"), values, strict=True):
                 one[name].append(value)
-            if direction >= 0 and step == round(rules.PUSH_AT / contract.period) + direction:
-                angle = 2 * math.pi * direction / rules.PUSH_DIRECTIONS
+            if direction >= 0 and step == round(walking.PUSH_AT / contract.period) + direction:
+                angle = 2 * math.pi * direction / walking.PUSH_DIRECTIONS
                 sim.data.qvel[:2] += exam.push_mark * np.array([math.cos(angle), math.sin(angle)])
             robot.write(safety.held(controller.act(robot.read(), command)[0]))
             for _ in range(round(contract.period / STEP)):
@@ -101,7 +101,7 @@ def main() -> None:
         ("over the wire", examine(folder, contract, exam, args.domain, faults)),
         ("through --eval", run_exam(folder, exam)),
     ):
-        print(f"{where}\n{rules.table(result)}", flush=True)
+        print(f"{where}\n{walking.table(result)}", flush=True)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from legged_mw.utils.opaque import fast
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 if TYPE_CHECKING:
-    from legged_mw.eval.grading import Graded
+    from legged_mw.eval.exams import Graded
 
 
 def start_quickly(gpu: str | None = "cpu") -> None:
@@ -92,7 +92,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
 def play() -> None:
     """Watch, grade or export a policy."""
     start_quickly()
-    from legged_mw.eval import grading
+    from legged_mw.eval import exams
     from legged_mw.rl.policies import find_policy, find_rival, introduce, load_trained
     from legged_mw.rl.rsl_rl_settings import check_classes
     from legged_mw.view import playing
@@ -105,7 +105,7 @@ def play() -> None:
     if args.eval:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         policies = [(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)]
-        grading.grade(policies, args, grade_export)
+        exams.grade(policies, args, grade_export)
         return
     if args.export:
         check_classes(trained.train)

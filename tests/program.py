@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from legged_mw import programs
-from legged_mw.eval import grading
+from legged_mw.eval import exams
 from legged_mw.rl import policies, run_folder
 from legged_mw.rl.runner import Runner
 from legged_mw.view import launch
@@ -98,7 +98,7 @@ def stopped_at_work() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Runner, "learn", begin)
-        for owner, name in ((launch, "watch"), (grading, "make_column"), (programs, "export")):
+        for owner, name in ((launch, "watch"), (exams, "make_column"), (programs, "export")):
             patch.setattr(owner, name, begin)
         yield
 

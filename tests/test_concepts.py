@@ -16,6 +16,7 @@ import torch
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.eval.exams import require_exam
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.utils.task import load_task
 
@@ -111,6 +112,20 @@ def a_checkpoint() -> Callable[[], object]:
     return save_and_load
 
 
+def an_exam() -> Callable[[], object]:
+    """From a roll-out to the table, as ``--eval`` does; the report that is drawn of it is left out."""
+    task = load_task("go1_flat")
+    exam = require_exam(task)
+    for path, value in {"sim.engine": "mujoco", "sim.fuse": False}.items():
+        task.set(path, value)
+    exam.prepare(task)
+    exam.make_room(task)
+    env, actions = LeggedRobot(task.cfg, "cpu"), torch.zeros(task.cfg.env.num_envs, 12)
+    stepped = env.step(actions)
+    env.step = lambda actions: stepped  # type: ignore[method-assign]
+    return lambda: exam.table(exam.examine(env, lambda obs: actions[: len(obs)])[0])
+
+
 # concept -> how it is run, most files to read, most files in which code runs
 BUDGETS: dict[str, tuple[Callable[[], Callable[[], object]], int, int]] = {
     "one step of walking": (a_step, 8, 15),
@@ -119,6 +134,7 @@ BUDGETS: dict[str, tuple[Callable[[], Callable[[], object]], int, int]] = {
     "a row of observations": (rows, 2, 6),
     "an iteration of PPO, without its steps": (an_iteration, 6, 16),
     "a checkpoint saved and resumed": (a_checkpoint, 4, 14),
+    "the walking exam, without its steps": (an_exam, 6, 19),
 }
 
 

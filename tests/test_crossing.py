@@ -17,24 +17,24 @@ from torch import Tensor
 
 from legged_mw import programs
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam, grading, plots
-from legged_mw.eval.crossing import TILES
-from legged_mw.eval.rules import LEVELS
+from legged_mw.eval import exams, plots, rollout, rough
+from legged_mw.eval.rough import TILES
+from legged_mw.eval.walking import LEVELS
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
 
 COMMANDS = slice(45, 48)  # of the group "state"
 
 
-def rough(kinds: dict[str, float]) -> LoadedTask:
+def rough_task(kinds: dict[str, float]) -> LoadedTask:
     task = load_task("go1_rough")
     task.set("terrain.terrain_proportions", kinds)
     return task
 
 
 def make_env(kinds: dict[str, float], repeats: int) -> LeggedRobot:
-    task = rough(kinds)
-    crossing.prepare(task, repeats)
+    task = rough_task(kinds)
+    rough.prepare(task, repeats)
     return task.env_class(task.cfg, "cpu")
 
 
@@ -43,9 +43,9 @@ def stand(obs: TensorDict) -> Tensor:
 
 
 def test_prepare_is_the_exam_but_for_ground_place_and_heading() -> None:
-    task = rough({"stairs_up": 0.9, "gap": 0.0, "flat": 0.1})
+    task = rough_task({"stairs_up": 0.9, "gap": 0.0, "flat": 0.1})
     task.set("terrain.tile_size", 12.0)  # whatever it was trained on
-    crossing.prepare(task)
+    rough.prepare(task)
     ground = task.cfg.terrain
     assert (ground.mesh_type, ground.curriculum, ground.tile_size, ground.horizontal_scale) == (
         "heightfield",
@@ -58,7 +58,7 @@ def test_prepare_is_the_exam_but_for_ground_place_and_heading() -> None:
         2 * TILES,
     )
     assert task.cfg.env.num_envs == 2 * LEVELS * 10
-    differs = {path for path, value in exam.OVERRIDES.items() if crossing.OVERRIDES.get(path) != value}
+    differs = {path for path, value in rollout.OVERRIDES.items() if rough.OVERRIDES.get(path) != value}
     assert differs == {
         "terrain.mesh_type",
         "init_state.pos_xy_range",
@@ -72,12 +72,12 @@ def test_a_ground_of_nothing_is_refused() -> None:
         ConfigError,
         match=r"terrain.terrain_proportions: no kind of ground has a share above 0; there are: flat, smooth_",
     ):
-        crossing.prepare(rough({"flat": 0.0}))
+        rough.prepare(rough_task({"flat": 0.0}))
 
 
 def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same number on each tile, each in a direction of its own; on stairs from the pit up, and from the top down."""
-    monkeypatch.setattr(crossing, "SECONDS", 0.06)
+    monkeypatch.setattr(rough, "SECONDS", 0.06)
     env = make_env({"stairs_up": 0.5, "stairs_down": 0.1}, 3)
     places, asked = [], []
 
@@ -86,7 +86,7 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
         asked.append(obs["state"][:, COMMANDS].clone())
         return stand(obs)
 
-    result = crossing.run_crossing(env, policy)
+    result = rough.run_crossing(env, policy)
     assert result["robots"] == 3 * TILES and list(result["kinds"]) == ["stairs_up", "stairs_down"]
     assert env.terrain is not None and env.tiles is not None
     # columns, levels, robots
@@ -99,18 +99,18 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
     torch.testing.assert_close(middles[:TILES, :, 0, 2], -8 * steps.expand(TILES, LEVELS))
     yaw = 2.0 * torch.atan2(places[0][:, 6], places[0][:, 3])
     assert len(yaw.unique()) == env.num_envs == 60 * TILES and yaw.min() < -2.5 and yaw.max() > 2.5
-    assert all((seen == torch.tensor([crossing.SPEED, 0.0, 0.0])).all() for seen in asked) and len(asked) == 3
+    assert all((seen == torch.tensor([rough.SPEED, 0.0, 0.0])).all() for seen in asked) and len(asked) == 3
 
 
 def test_the_same_whatever_the_seed_and_nothing_drawn_outside(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crossing, "SECONDS", 0.3)
+    monkeypatch.setattr(rough, "SECONDS", 0.3)
     mix = torch.randn(48, 12, generator=torch.Generator().manual_seed(0))
     ends = []
     for seed in (1, 2):
         torch.manual_seed(seed)
         env = make_env({"waves": 1.0}, 1)  # a robot a tile
         before = torch.get_rng_state()
-        crossing.run_crossing(env, lambda obs: 0.3 * torch.sin(obs["state"] @ mix))
+        rough.run_crossing(env, lambda obs: 0.3 * torch.sin(obs["state"] @ mix))
         assert torch.equal(before, torch.get_rng_state())
         ends.append(env.sim.qpos.clone())
     assert torch.equal(*ends)
@@ -130,7 +130,7 @@ def carry(env: LeggedRobot, script: dict[int, list[tuple[int, Callable[[LeggedRo
         step += 1
         return stand(obs)
 
-    return crossing.run_crossing(env, policy)
+    return rough.run_crossing(env, policy)
 
 
 def move(distance: float, axis: int = 0) -> Callable[[LeggedRobot, int], None]:
@@ -155,8 +155,8 @@ def lose(env: LeggedRobot, world: int) -> None:
 
 def test_who_crossed_and_who_fell(monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot a level; each counts once, by what came first."""
-    monkeypatch.setattr(crossing, "TILES", 1)
-    monkeypatch.setattr(crossing, "SECONDS", 0.4)
+    monkeypatch.setattr(rough, "TILES", 1)
+    monkeypatch.setattr(rough, "SECONDS", 0.4)
     script = {
         3: [
             (1, move(4.1)),
@@ -178,8 +178,8 @@ def test_who_crossed_and_who_fell(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_shares_are_by_kind_and_level(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crossing, "SECONDS", 0.1)
-    monkeypatch.setattr(crossing, "TILES", 2)
+    monkeypatch.setattr(rough, "SECONDS", 0.1)
+    monkeypatch.setattr(rough, "TILES", 2)
 
     def world(column: int, level: int, robot: int) -> int:
         return (column * LEVELS + level) * 2 + robot
@@ -206,7 +206,7 @@ def test_table() -> None:
         "fell": [0.2] * 10,
     }
     flat = {"measure": None, "values": None, "crossed": [1.0] * 10, "fell": [0.0] * 10}
-    text = crossing.table({"speed": 0.6, "seconds": 15.0, "robots": 20, "kinds": {"flat": flat, "stairs_up": stairs}})
+    text = rough.table({"speed": 0.6, "seconds": 15.0, "robots": 20, "kinds": {"flat": flat, "stairs_up": stairs}})
     assert text.splitlines() == [
         "share of 20 robots that crossed a tile at 0.6 m/s within 15 s",
         "level                 0      1      2      3      4      5      6      7      8      9     mean   fell",
@@ -242,8 +242,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Both cross the ground that the user chose; tables, figures, picture and chapter are there."""
     root, folder = runs
-    monkeypatch.setattr(exam, "SECONDS", 2.1)
-    monkeypatch.setattr(crossing, "SECONDS", 0.1)
+    monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
+    monkeypatch.setattr(rough, "SECONDS", 0.1)
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     draw = plots.sections
     monkeypatch.setattr(plots, "sections", lambda *args: draw(*args)[:2])  # the others are drawn in test_report
@@ -286,8 +286,8 @@ def test_what_it_decides_cannot_be_overridden(runs: tuple[Path, Path], more: lis
 
 def test_only_what_was_trained_on_rough_ground_crosses_it() -> None:
     args = Namespace(eval=True, override=[], set=["terrain.friction=0.4"])
-    assert grading.prepare_crossing(load_task("go1_flat"), args) is None
-    task = grading.prepare_crossing(load_task("go1_rough"), args)
+    assert exams.prepare_crossing(load_task("go1_flat"), args) is None
+    task = exams.prepare_crossing(load_task("go1_rough"), args)
     assert task is not None and task.cfg.terrain.friction == 0.4 and task.cfg.env.num_envs == 8 * LEVELS * 10
 
 

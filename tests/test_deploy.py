@@ -32,7 +32,7 @@ from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.seal import checksum, sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import exam, rules
+from legged_mw.eval import rollout, walking
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.cli import one_line_errors
@@ -442,8 +442,8 @@ def test_walks_as_in_the_environment(contract: Contract) -> None:
     """Observations agree to float32's rounding at first; then errors grow, as they do in a walk, but the walk is the same."""
     task = load_task("go1_flat")
     update_from_run(task, load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
-    exam.prepare(task)
-    commands = np.array(rules.ExamRules.from_config(task.cfg).commands())
+    rollout.prepare(task)
+    commands = np.array(walking.ExamRules.from_config(task.cfg).commands())
     task.cfg.env.num_envs = len(commands)
     env = task.env_class(task.cfg, "cpu")
     policy = load_policy(SHIPPED / "policy.onnx", env, task.train, "cpu")
@@ -590,9 +590,9 @@ def test_an_end_that_nobody_judges_is_said(export: Path, capsys: pytest.CaptureF
 
 def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first seconds of it, with every push: written and printed."""
-    monkeypatch.setattr(rules, "SECONDS", 2.6)
-    monkeypatch.setattr(rules, "PUSH_AT", 1.0)
-    monkeypatch.setattr(rules, "PUSH_UNTIL", 2.2)
+    monkeypatch.setattr(walking, "EXAM_SECONDS", 2.6)
+    monkeypatch.setattr(walking, "PUSH_AT", 1.0)
+    monkeypatch.setattr(walking, "PUSH_UNTIL", 2.2)
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "exam.json")
     assert code == 0, err
     saved = json.loads((tmp_path / "exam.json").read_text())
@@ -613,7 +613,7 @@ def test_results_of_a_shipped_policy_go_to_the_logs(
     """The package may be another user's."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
-    monkeypatch.setattr(rules, "table", lambda _: "the table")
+    monkeypatch.setattr(walking, "table", lambda _: "the table")
     shown = []
     monkeypatch.setattr(program.launch, "watch", lambda stage, args, folder, **_: shown.append(folder.absolute()))
     before = sorted(path.name for path in SHIPPED.iterdir())
@@ -651,7 +651,7 @@ def test_a_result_that_cannot_be_written(
 ) -> None:
     """Refused before the exam; or after it, where the disk changed meanwhile: the table is out by then."""
     monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
-    monkeypatch.setattr(rules, "table", lambda _: "the table")
+    monkeypatch.setattr(walking, "table", lambda _: "the table")
     (tmp_path / "file").write_text("")
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
     assert (
@@ -882,8 +882,8 @@ class Block:
             raise ModuleNotFoundError(f'{name} is blocked', name=name)
 
 sys.meta_path.insert(0, Block())
-from legged_mw.eval import rules
-rules.SECONDS, rules.PUSH_AT, rules.PUSH_UNTIL = 2.1, 0.5, 1.5
+from legged_mw.eval import walking
+walking.EXAM_SECONDS, walking.PUSH_AT, walking.PUSH_UNTIL = 2.1, 0.5, 1.5
 import runpy
 sys.argv = ['deploy', *sys.argv[1:]]
 runpy.run_module('legged_mw.deploy', run_name='__main__')

@@ -22,7 +22,7 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import NAMES, LimitError, Limits, Safety, Trip, Tripped, parse_limits
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import rules
+from legged_mw.eval import walking
 from legged_mw.utils.commands import VELOCITY
 
 POLICIES = ROOT / "resources/policies"
@@ -364,7 +364,7 @@ def test_shipped_policies_trip_nothing(name: str) -> None:
     folder = POLICIES / name
     contract = read_contract(folder)
     exam, names = contract_rules(contract), [command.name for command in contract.commands]
-    directions = np.arange(rules.PUSH_DIRECTIONS) * 2 * math.pi / rules.PUSH_DIRECTIONS
+    directions = np.arange(walking.PUSH_DIRECTIONS) * 2 * math.pi / walking.PUSH_DIRECTIONS
     kicks = [
         speed * np.array([math.cos(a), math.sin(a)]) for speed in exam.push_speeds if speed <= 2.0 for a in directions
     ]

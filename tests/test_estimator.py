@@ -26,11 +26,10 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, figures, page, plots, rules
-from legged_mw.eval.page import Column
-from legged_mw.eval.rollout import Record, holding, roll_out
-from legged_mw.eval.rules import ExamRules
-from legged_mw.eval.training import training_figures
+from legged_mw.eval import figures, plots, report, rollout, walking
+from legged_mw.eval.report import Column
+from legged_mw.eval.rollout import Record, holding, roll_out, training_figures
+from legged_mw.eval.walking import ExamRules
 from legged_mw.export.network import ExportedPolicy, run_onnx
 from legged_mw.rl.policies import ESTIMATE, act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
@@ -378,8 +377,10 @@ class Believer:
 @pytest.fixture(scope="module")
 def record() -> Record:
     task = load_task("go1_flat")
-    exam.prepare(task, 3)
-    return roll_out(LeggedRobot(task.cfg, "cpu"), Believer(), [holding((0.5, 0.0, 0.0))] * 3, 30, exam.SIGNALS, alone=2)
+    rollout.prepare(task, 3)
+    return roll_out(
+        LeggedRobot(task.cfg, "cpu"), Believer(), [holding((0.5, 0.0, 0.0))] * 3, 30, rollout.SIGNALS, alone=2
+    )
 
 
 def test_an_estimate_stands_beside_the_velocity_of_the_same_moment(record: Record) -> None:
@@ -407,11 +408,11 @@ def test_the_exams_root_mean_square_error() -> None:
     """Over the commands at which it did not fall, settled; and nothing is said of a policy that estimates nothing."""
     result = graded((0.03, 0.04), fell=2)
     assert result["estimate_rms"] == pytest.approx([0.03, 0.04], abs=1e-5)
-    table = rules.table(result)
+    table = walking.table(result)
     assert "estimate of vx, rms [m/s]            0.030\nestimate of vy, rms [m/s]            0.040\n" in table
     fallen = graded((0.03, 0.04), fell=22)
-    assert fallen["estimate_rms"] is None and "estimate of vx, rms [m/s]             none\n" in rules.table(fallen)
-    assert "estimate_rms" not in graded(None) and "estimate" not in rules.table(graded(None))
+    assert fallen["estimate_rms"] is None and "estimate of vx, rms [m/s]             none\n" in walking.table(fallen)
+    assert "estimate_rms" not in graded(None) and "estimate" not in walking.table(graded(None))
 
 
 def test_the_exam_during_training_has_it_too(record: Record) -> None:
@@ -446,7 +447,7 @@ def test_the_report_draws_it_and_compares_it_with_a_policy_that_has_none() -> No
     columns = [Column("one", {}, graded((0.03, 0.04))), Column("other", {}, graded(None))]
     results = [column.exam for column in columns]
     asked = ExamRules.from_mapping(results[0]["rules"])
-    table = page.exam_table(columns, [asked.figures(result, others=results) for result in results], "")
+    table = report.exam_table(columns, [asked.figures(result, others=results) for result in results], "")
     assert "estimate of vx, rms [m/s]</th>" in table and ">0.030</span>" in table and ">none</span>" in table
 
 
@@ -454,12 +455,12 @@ def test_deploys_exam_measures_it_as_the_environments_does(
     policy: EstimatingModel, run_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two seconds and a half of both, of a policy that has learned nothing: the same truth and the same belief."""
-    for module in (rules, exam):
-        monkeypatch.setattr(module, "SECONDS", 2.5)
+    for module in (walking, rollout):
+        monkeypatch.setattr(module, "EXAM_SECONDS", 2.5)
     task = task_with(**{"exam__push_speeds": [1.0], "exam__push_mark": 1.0})
     asked = ExamRules.from_config(task.cfg)
-    exam.prepare(task)
-    here = exam.run_exam(LeggedRobot(task.cfg, "cpu"), policy)
+    rollout.prepare(task)
+    here = rollout.run_exam(LeggedRobot(task.cfg, "cpu"), policy)
     there = run_exam(run_folder / "export", asked)
     assert here["falls"] == there["falls"] < 22
     assert here["estimate_rms"] == pytest.approx(there["estimate_rms"], rel=0.02)

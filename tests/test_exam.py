@@ -26,12 +26,10 @@ from legged_mw.deploy.exam import contract_rules
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.eval import exam, grading, plots, report, rules
+from legged_mw.eval import exams, plots, rollout, walking
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
-from legged_mw.eval.peers import PEERS, best_of
 from legged_mw.eval.rollout import holding, roll_out
-from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.eval.rules import table as rules_table
+from legged_mw.eval.walking import PEERS, ExamRules, best_of, in_common
 from legged_mw.rl.policies import PolicySource
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
@@ -173,7 +171,7 @@ def test_beating_several_peers_is_beating_each() -> None:
     assert rules.beats_peer(just) and rules.reached(just) == (1 + 9 + 1 + 8 + 1, 20)
     worse = changed(changed(changed(just, "offset.1", 0.051), "drift", 0.0049), "pushes.6", 0.375)
     assert not rules.beats_peer(worse) and rules.reached(worse) == (18, 20)
-    text = rules_table({**worse, "walks": True, "beats_peer": False, "rules": rules.to_mapping()})
+    text = walking.table({**worse, "walks": True, "beats_peer": False, "rules": rules.to_mapping()})
     assert (
         text.startswith("asked: vx -2 to 2 m/s, vy -1 to 1 m/s, yaw rate -2 to 2 rad/s\n")
         and "best of 3\n" in text.splitlines()[1] + "\n"
@@ -200,7 +198,7 @@ def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
 def test_the_common_range_in_training_and_in_deploy() -> None:
     """It goes before what the config says of the ranges and speeds; the rest of the section stays."""
     flags = argparse.Namespace(override=[], set=["exam.peer=go2", "exam.push_speeds=[2, 3]"])
-    graded = grading.prepare(
+    graded = exams.prepare(
         PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True
     )
     asked = ExamRules.from_config(graded.task.cfg)
@@ -212,9 +210,9 @@ def test_the_common_range_in_training_and_in_deploy() -> None:
     with pytest.raises(
         ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"
     ):
-        grading.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
-    rival = grading.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
-    report.ask_alike([graded.task, rival.task])  # a rival is asked what the first one is, whatever it knows of peers
+        exams.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
+    rival = exams.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
+    rollout.ask_alike([graded.task, rival.task])  # a rival is asked what the first one is, whatever it knows of peers
     assert (
         ExamRules.from_config(rival.task.cfg) == asked and rival.task.cfg.env.num_envs == graded.task.cfg.env.num_envs
     )
@@ -238,7 +236,7 @@ def test_an_older_name_of_the_peer_is_read() -> None:
         ({"push_speeds": [0.0, 2.0]}, "exam.push_speeds is [0.0, 2.0]; it must be one or more numbers above zero"),
         ({"push_speeds": [1.0]}, "exam.push_mark is 2; it must be one of exam.push_speeds, [1.0]"),
         ({"marks": [0.1]}, "exam.marks is [0.1]; it must be three numbers, or an empty list"),
-        ({"peer": "go11"}, "exam.peer: no robot 'go11' in legged_mw/eval/peers.py; did you mean 'go1'?"),
+        ({"peer": "go11"}, "exam.peer: no robot 'go11' in resources/peers.yaml; did you mean 'go1'?"),
     ],
 )
 def test_rules_that_cannot_be_applied(given: dict[str, Any], line: str) -> None:
@@ -264,7 +262,7 @@ def test_rules_of_an_export() -> None:
     ("section", "line"),
     [
         ({"push_speeds": 3.0}, "policy.yaml: exam: 'float' object is not iterable"),
-        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no robot 'nobody' in legged_mw/eval/peers.py"),
+        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no robot 'nobody' in resources/peers.yaml"),
     ],
 )
 def test_a_contract_with_another_section(section: dict[str, Any], line: str) -> None:
@@ -318,7 +316,7 @@ def test_prepare_leaves_nothing_to_chance() -> None:
         task.set(path, 3.0)
     task.set("perturbation.kick", True)
     task.set("env.episode_length_s", 1.0)
-    exam.prepare(task)
+    rollout.prepare(task)
     cfg = task.cfg
     init = cfg.init_state
     assert (init.pos_xy_range, init.yaw_range, init.lin_vel_range, init.ang_vel_range, cfg.noise.level) == (
@@ -329,7 +327,7 @@ def test_prepare_leaves_nothing_to_chance() -> None:
         0,
     )
     assert cfg.perturbation.kick is False and cfg.commands.resampling_time == 0
-    assert cfg.env.episode_length_s > rules.SECONDS and cfg.env.num_envs == WORLDS
+    assert cfg.env.episode_length_s > walking.EXAM_SECONDS and cfg.env.num_envs == WORLDS
 
 
 # ---- the arithmetic, with a made-up environment whose figures are known
@@ -388,7 +386,7 @@ def follow(env: FakeRobot, step: int) -> None:
 
 
 def grade(env: Any, policy: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
-    return exam.run_exam(env, policy or (lambda obs: torch.zeros(len(obs), 12)))
+    return rollout.run_exam(env, policy or (lambda obs: torch.zeros(len(obs), 12)))
 
 
 def test_worlds_are_commanded_and_the_policy_sees_it() -> None:
@@ -481,13 +479,13 @@ def test_cost_of_transport_at_a_command_of_its_own() -> None:
         and "beats_peer" not in result
     )
     assert result["falls"] == 1 and len(result["commands"]) == 22 and result["pushes"] == {"1": 1.0, "2": 1.0}
-    text = rules.table(result)
+    text = walking.table(result)
     assert "cost of transport at 0.75 m/s" in text and "peer" not in text and text.endswith("walks: no")
     fallen = grade(FakeRobot(script, {5: [22]}, **asked))
     assert (
         fallen["falls"] == 0
         and fallen["cost_of_transport"] is None
-        and "cost of transport at 0.75 m/s         none" in rules.table(fallen)
+        and "cost of transport at 0.75 m/s         none" in walking.table(fallen)
     )
 
 
@@ -503,8 +501,8 @@ def test_offsets_are_what_remains_of_the_mean_velocity() -> None:
     assert strict["offset"] == mild["offset"] == pytest.approx([0.05, 0, 0], abs=1e-4)
     assert mild["commands"][4]["offset"] == pytest.approx([0.05, 0, 0], abs=1e-4)
     assert (strict["walks"], mild["walks"]) == (False, True)
-    assert "of the mean velocity" not in rules.table(strict)
-    assert rules.table(mild).count("  of the mean velocity               0.0") == 3
+    assert "of the mean velocity" not in walking.table(strict)
+    assert walking.table(mild).count("  of the mean velocity               0.0") == 3
 
 
 def test_further_commands_stay_at_their_default() -> None:
@@ -552,7 +550,9 @@ def test_falls() -> None:
     assert grade(FakeRobot(script))["worst"] == pytest.approx([1, 1, 0])
     lying = grade(FakeRobot(follow, {9: list(range(TRACKED))}))
     assert lying["falls"] == 22 and lying["worst"] == [1.5, 0.8, 1.2] and lying["drift"] is None
-    assert "error vx [m/s]                       0.568" in rules.table(lying)  # (0.5 + 1 + 1.5 + 0.5 + 1 + 8 x 1) / 22
+    assert "error vx [m/s]                       0.568" in walking.table(
+        lying
+    )  # (0.5 + 1 + 1.5 + 0.5 + 1 + 8 x 1) / 22
 
 
 def test_a_push_is_survived_if_it_stands_until_step_300() -> None:
@@ -645,7 +645,7 @@ def test_does_not_beat_the_peer(path: str, value: float) -> None:
 
 def test_table_names_every_figure() -> None:
     result = grade(FakeRobot(follow))
-    text = rules.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
+    text = walking.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
     for part in (
         "0.1234",
         "4.56",
@@ -665,7 +665,7 @@ def test_table_names_every_figure() -> None:
 def standing() -> tuple[dict[str, Any], Tensor]:
     """Zero action, which stands in the default pose: the result, and qvel (500, N, 18) as the policy saw it."""
     task = load_task("go1_flat")
-    exam.prepare(task)
+    rollout.prepare(task)
     env = LeggedRobot(task.cfg, "cpu")
     seen = []
 
@@ -673,7 +673,7 @@ def standing() -> tuple[dict[str, Any], Tensor]:
         seen.append(env.sim.qvel.clone())
         return torch.zeros(WORLDS, 12)
 
-    return exam.run_exam(env, policy), torch.stack(seen)
+    return rollout.run_exam(env, policy), torch.stack(seen)
 
 
 def test_standing_still(standing: tuple[dict[str, Any], Tensor]) -> None:
@@ -699,17 +699,17 @@ def test_real_pushes_move_the_robot_and_throw_it(standing: tuple[dict[str, Any],
 
 def test_two_exams_are_the_same_exam(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the seed, with a policy that answers to every observation."""
-    monkeypatch.setattr(exam, "SECONDS", 2.4)
-    monkeypatch.setattr(exam, "PUSH_AT", 0.6)
+    monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.4)
+    monkeypatch.setattr(rollout, "PUSH_AT", 0.6)
     mix = torch.randn(48, 12, generator=torch.Generator().manual_seed(0))
     results = []
     for seed in (1, 2):
         task = load_task("go1_flat")
         task.set("perturbation.kick", True)  # a task that kicks while it trains
-        exam.prepare(task)
+        rollout.prepare(task)
         torch.manual_seed(seed)
         env = LeggedRobot(task.cfg, "cpu")
-        results.append(exam.run_exam(env, lambda obs: 0.3 * torch.sin(obs["state"] @ mix)))
+        results.append(rollout.run_exam(env, lambda obs: 0.3 * torch.sin(obs["state"] @ mix)))
         for row in results[-1]["commands"]:
             if row["fell"]:
                 row["error"] = "not graded"  # from the fall on, the world follows a new command, and that one is drawn
@@ -719,8 +719,8 @@ def test_two_exams_are_the_same_exam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The table is printed, the figures go into the run folder; a user's own override still counts, the exam's worlds do not move."""
-    for place in (exam, rules):  # by the environment, and by the export
-        monkeypatch.setattr(place, "SECONDS", 2.1)
+    for place in (rollout, walking):  # by the environment, and by the export
+        monkeypatch.setattr(place, "EXAM_SECONDS", 2.1)
     monkeypatch.setattr(plots, "sections", lambda *_: [])  # drawn in test_report
     folder = trained(tmp_path, "--max_iterations", "1")
     result = run("play", tmp_path, *SMALL[:2], "--device", "cpu", "--eval", "--set", "terrain.friction=0.4")
@@ -744,7 +744,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
-    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     monkeypatch.setattr(plots, "sections", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from legged_mw.eval import figures, motors
-from legged_mw.eval.rollout import Record
+from legged_mw.eval import figures
+from legged_mw.eval.figures import Record
 
 DT = 0.02
 
@@ -168,11 +168,13 @@ def test_share_of_time_at_a_motors_envelope() -> None:
     speed = np.repeat([0.0, 15.0, 15.0], [20, 30, 50])[:, None, None].repeat(3, axis=2)
     torque = np.repeat([-15.0, 8.0, 7.0], [20, 30, 50])[:, None, None].repeat(3, axis=2)
     torque[:, :, 1] = 0.0
-    limits = motors.MotorLimits(
+    limits = figures.MotorLimits(
         *(np.array([sign * 15.0, sign * 15.0, sign * np.inf]) for sign in (-1.0, 1.0)),
         *(np.array([value, value, np.inf]) for value in (20.0, 25.0)),
     )
-    knee, ankle = motors.envelopes(make(1, 100, torque=torque, motor_speed=speed), 0, ["knee", "knee", "ankle"], limits)
+    knee, ankle = figures.envelopes(
+        make(1, 100, torque=torque, motor_speed=speed), 0, ["knee", "knee", "ankle"], limits
+    )
     assert knee["kind"] == "knee" and knee["at_limit"] == pytest.approx(0.25), "one of two joints in half of the time"
     assert np.sum(knee["counts"]) == 200 and np.sum(ankle["counts"]) == 100
     assert (ankle["at_limit"], ankle["envelope"]) == (None, None)

@@ -18,7 +18,7 @@ from legged_mw import ROOT, programs
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.eval import exam, plots
+from legged_mw.eval import plots, rollout
 from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
 from legged_mw.utils.config import ConfigError
@@ -278,9 +278,11 @@ def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
     env.reset_envs(torch.arange(500) < 1)
     assert same(env.dof_pos[1:], kept) and not env.last_dof_vel[0].any() and env.last_dof_vel[1:].all()
     task = load_task(TASK)
-    exam.prepare(task)
+    rollout.prepare(task)
     assert task.cfg.init_state.dof_pos_range == [1.0, 1.0] and not task.cfg.perturbation.kick
-    graded = make_env(2, {path: value for path, value in exam.OVERRIDES.items() if path != "env.num_envs"}, task=TASK)
+    graded = make_env(
+        2, {path: value for path, value in rollout.OVERRIDES.items() if path != "env.num_envs"}, task=TASK
+    )
     assert torch.equal(graded.dof_pos, graded.default_dof_pos.expand(2, -1))
     graded.commands[:] = torch.tensor([0.1, 0.0, 1.2])  # the exam's commands are its own: no steering, no limit
     graded.compute_observations()
@@ -292,7 +294,7 @@ def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
 
 
 def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
     small = [
         "--set",
         "actor.hidden_dims=[16]",

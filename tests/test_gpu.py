@@ -20,7 +20,7 @@ from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.snapshot import take_snapshot
-from legged_mw.eval.training import TrainingExam
+from legged_mw.eval.rollout import TrainingExam
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.rl.policies import PolicySource, Trained
 from legged_mw.rl.ppo import GraphedPPO

@@ -20,9 +20,8 @@ from legged_mw.deploy.contract import CONTRACT_FILE, read_contract
 from legged_mw.deploy.controller import Controller, Network
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing
-from legged_mw.eval.exam import OVERRIDES
-from legged_mw.eval.rollout import holding, roll_out
+from legged_mw.eval import rough
+from legged_mw.eval.rollout import OVERRIDES, holding, roll_out
 from legged_mw.export import replay as export_replay
 from legged_mw.export.exporter import ExportError, export
 from legged_mw.rl.learner_config import fit_cpu
@@ -230,13 +229,13 @@ def test_a_roll_out_and_a_crossing_say_where_an_episode_ended(monkeypatch: pytes
     one, other = Forgetful(), Forgetful()
     roll_out(make_env(3, {**OVERRIDES, "env.episode_length_s": 0.06}), one, [holding((0.0, 0.0, 0.0))] * 3, 4, {})
     assert one.forgotten == [None, [], [], [0, 1, 2], []]
-    monkeypatch.setattr(crossing, "SECONDS", 0.06)
+    monkeypatch.setattr(rough, "SECONDS", 0.06)
     task = load_task("go1_rough")
     task.set("terrain.terrain_proportions", {"flat": 1.0})
-    crossing.prepare(task, repeats=1)
+    rough.prepare(task, repeats=1)
     env = task.env_class(task.cfg, "cpu")
     env.max_episode_length = 2
-    crossing.run_crossing(env, other)
+    rough.run_crossing(env, other)
     everyone = list(range(env.num_envs))
     assert other.forgotten == [None, [], everyone, []]
 

@@ -1,4 +1,4 @@
-"""docs/published_policies.md's tables hold the figures of eval/peers.py, and of the policies that ship."""
+"""docs/published_policies.md's tables hold the figures of resources/peers.yaml, and of the policies that ship."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import pytest
 
 from legged_mw import ROOT
-from legged_mw.eval.peers import PEERS, Peer
+from legged_mw.eval.walking import PEERS, Peer
 
 PAGE = (ROOT / "docs/published_policies.md").read_text()
 PUSHES = {"go2": "123456", "g1": ("0.5", "1", "1.5", "2", "3")}  # [m/s] those that the exam of the shipped policy asks

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from program import SMALL, run
 
-from legged_mw.eval import training
+from legged_mw.eval import rollout
 from legged_mw.rl import iteration_log
 from legged_mw.rl.iteration_log import LOG_FILE, Console
 
@@ -113,8 +113,8 @@ def test_without_a_disk_the_training_goes_on(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_run_has_its_log_and_the_next_exam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, seconds in (("SECONDS", 0.06), ("SETTLING", 0.02), ("PUSH_AT", 0.02)):
-        monkeypatch.setattr(training, name, seconds)
+    for name, seconds in (("TRAINING_SECONDS", 0.06), ("TRAINING_SETTLING", 0.02), ("TRAINING_PUSH_AT", 0.02)):
+        monkeypatch.setattr(rollout, name, seconds)
     result = run("train", tmp_path, *SMALL, "--max_iterations", "3", "--set", "runner.exam_interval=2")
     assert result.code == 0, result.err
     until = [

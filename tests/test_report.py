@@ -16,12 +16,10 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT, programs
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, exams, page, plots, report
-from legged_mw.eval.page import Column
-from legged_mw.eval.peers import PEERS
-from legged_mw.eval.rollout import Case, Push, roll_out
-from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.eval.trials import make_plan
+from legged_mw.eval import exams, plots, report, rollout
+from legged_mw.eval.report import Column
+from legged_mw.eval.rollout import Case, Push, make_plan, roll_out
+from legged_mw.eval.walking import PEERS, ExamRules, in_common
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.config import load_yaml
@@ -41,15 +39,15 @@ def shipped() -> LoadedTask:
 def both() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """The shipped policy, 2.4 s: the plain exam's result, the report's, and the report's figures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(exam, "SECONDS", 2.4)
-        patch.setattr(exam, "PUSH_AT", 0.6)
+        patch.setattr(rollout, "EXAM_SECONDS", 2.4)
+        patch.setattr(rollout, "PUSH_AT", 0.6)
         task = shipped()
-        exam.prepare(task)
+        rollout.prepare(task)
         env = task.env_class(task.cfg, "cpu")
         policy = load_policy(SHIPPED / "policy.onnx", env, task.train, "cpu")
-        plain = exam.run_exam(env, lambda obs: act(policy, obs))
-        report.prepare(task)
-        return plain, *report.examine(task.env_class(task.cfg, "cpu"), lambda obs: act(policy, obs))
+        plain = rollout.run_exam(env, lambda obs: act(policy, obs))
+        rollout.prepare_report(task)
+        return plain, *rollout.examine(task.env_class(task.cfg, "cpu"), lambda obs: act(policy, obs))
 
 
 def test_the_reports_exam_is_the_plain_exam(both: tuple[dict[str, Any], ...]) -> None:
@@ -88,7 +86,7 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
 def test_the_plan() -> None:
     """Exam first; grids over the trained ranges; the same steps in each world, later and later."""
     plan = make_plan(shipped().cfg, 0.02)
-    assert plan.cases[: GO1.worlds()] == exam.cases(GO1, 0.02)
+    assert plan.cases[: GO1.worlds()] == rollout.cases(GO1, 0.02)
     assert [plan.parts[name] for name in ("commands", "transport", "pushes")] == [
         slice(0, 22),
         slice(22, 22),
@@ -116,7 +114,7 @@ def test_the_plan() -> None:
 
 def test_a_roll_out_begins_with_a_history_of_its_own_command() -> None:
     task = load_task("go1_flat")
-    exam.prepare(task, 2)
+    rollout.prepare(task, 2)
     task.cfg.observations.history = {"state": 3}
     env, seen = LeggedRobot(task.cfg, "cpu"), []
 
@@ -130,7 +128,7 @@ def test_a_roll_out_begins_with_a_history_of_its_own_command() -> None:
 
 def test_commands_change_and_pushes_come_when_they_should() -> None:
     task = load_task("go1_flat")
-    exam.prepare(task, 2)
+    rollout.prepare(task, 2)
     env = LeggedRobot(task.cfg, "cpu")
     cases = [Case(((0, (0.5, 0.0, 0.0)), (3, (0.0, 0.4, 0.0)))), Case(((0, (0.0, 0.0, 0.0)),), Push(2, 1.0, 0.0))]
     seen, speed = [], []
@@ -172,9 +170,13 @@ def pages(both: tuple[dict[str, Any], ...], tmp_path_factory: pytest.TempPathFac
         "device": "cpu",
         "overrides": {"noise.level": 0.0},
     }
-    columns = [report.Column("<first>", about, result, figures), report.Column("rival", about, fallen, nothing)]
     other = {**result, "error": [value + 0.004 for value in result["error"]]}
-    report.write(folder, "go1_flat", columns, extras=[("by numpy", other)])
+    columns = [
+        Column("<first>", about, result, figures),
+        Column("by numpy", {}, other),
+        Column("rival", about, fallen, nothing),
+    ]
+    report.write(folder, "go1_flat", columns)
     return folder
 
 
@@ -275,9 +277,9 @@ def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...
         sections = {section.name: section for section in plots.sections([("mine", figures)], rules)}
         drawn.append("".join(plots.svgs(sections["tracking"]._replace(panels=sections["tracking"].panels[:1]))))
     assert ">0.06</text>" in drawn[1] and ">0.06</text>" not in drawn[0]
-    html = page.html("biped", asked, [Column("mine", {}, graded, figures)], [(sections["tracking"], [])])
+    html = report.walking_page("biped", asked, [Column("mine", {}, graded, figures)], [(sections["tracking"], [])])
     assert "The stroke on each scale" not in html and "vx offset" in html and "of the mean velocity" in html
-    assert "The stroke on each scale" in page.html(
+    assert "The stroke on each scale" in report.walking_page(
         "go1", GO1, [Column("mine", {}, result, figures)], [(sections["tracking"], [])]
     )
     assert ">2 fell</text>" in "".join(plots.svgs(sections["steps"]._replace(panels=sections["steps"].panels[:1])))
@@ -299,10 +301,10 @@ def test_two_policies_are_asked_the_same() -> None:
     first, second = shipped(), shipped()
     second.cfg.commands.ranges.lin_vel_x = [0.5, 0.5]
     for task in (first, second):
-        report.prepare(task)
+        rollout.prepare_report(task)
     worlds = second.cfg.env.num_envs
     assert ExamRules.from_config(second.cfg) != GO1
-    report.ask_alike([first, second])
+    rollout.ask_alike([first, second])
     assert ExamRules.from_config(first.cfg) == ExamRules.from_config(second.cfg) == GO1
     # no world more for the cost of transport
     assert first.cfg.exam.ranges == {} and second.cfg.env.num_envs == worlds - 1
@@ -312,11 +314,9 @@ def test_compare_grades_each_by_its_own_config(
     two_runs: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, first, second = two_runs
-    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
     written: list[Any] = []
-    kind = exams.EXAMS["walking"]._replace(
-        write=lambda folder, task, columns, extras: written.extend([folder, task, *columns])
-    )
+    kind = exams.EXAMS["walking"]._replace(write=lambda folder, task, columns: written.extend([folder, task, *columns]))
     monkeypatch.setitem(exams.EXAMS, "walking", kind)
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
@@ -384,5 +384,5 @@ def test_tables_of_two_policies_with_other_ranges() -> None:
         steps = {axis: {"numbers": [number] * changes} for axis in ("vx", "vy", "yaw")}
         return Column(name, {}, {}, {"steps": steps, "foot_names": []})
 
-    table = page._extra("steps", [column("first", 2), column("second", 3)])
+    table = report._extra("steps", [column("first", 2), column("second", 3)])
     assert table.count(", first") == 6 and table.count(", second") == 9

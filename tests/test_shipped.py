@@ -19,7 +19,7 @@ from legged_mw.deploy.exam import contract_skill, perform
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.eval import exam, rules
+from legged_mw.eval import rollout, walking
 from legged_mw.export.exporter import FILES
 from legged_mw.export.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
@@ -47,11 +47,11 @@ def trained(folder: Path) -> LoadedTask:
     "folder", [folder for folder in POLICIES if folder not in SKILLED], ids=lambda folder: folder.name
 )
 def test_walks_and_both_formats_agree(folder: Path) -> None:
-    exam.prepare(task := trained(folder))
+    rollout.prepare(task := trained(folder))
     env = task.env_class(task.cfg, "cpu")
     policy = check_formats(folder, task, env)
-    result = exam.run_exam(env, lambda state: act(policy, state))
-    assert result["walks"], rules.table(result)
+    result = rollout.run_exam(env, lambda state: act(policy, state))
+    assert result["walks"], walking.table(result)
 
 
 @pytest.mark.parametrize("folder", SKILLED, ids=lambda folder: folder.name)
@@ -93,7 +93,7 @@ def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tm
     """Of g1_flat, whose policy asks its ankles for more than their range in every step; the scene is not there."""
     folder, task = ROOT / "resources/policies/g1_flat", load_task("g1_flat")
     update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
-    exam.prepare(task)
+    rollout.prepare(task)
     task.cfg.env.num_envs = 2
     env, stage = task.env_class(task.cfg, "cpu"), DeployStage(folder, 2)
     policy, alone = load_policy(folder / "policy.onnx", env, task.train, "cpu"), tmp_path / "alone"

@@ -18,9 +18,9 @@ from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.exam import SwitchStage, contract_skill, put_on, run_skill
 from legged_mw.deploy.simulated import Fleet
-from legged_mw.eval import getup, handstand, strip
+from legged_mw.eval import perform, skills
 from legged_mw.eval.perform import machine, on_ground
-from legged_mw.eval.skill import ExamGround, ExamRobot, Recording
+from legged_mw.eval.skills import ExamGround, ExamRobot, Recording
 from legged_mw.skills.drop_states import fallen
 from legged_mw.skills.getup import Getup
 from legged_mw.skills.handstand import Handstand
@@ -143,7 +143,7 @@ def recording(robot: ExamRobot, seconds: float, count: int) -> Recording:
 
 def test_what_getup_judges(robot: ExamRobot) -> None:
     """Up at once; up after 2 s; too late; down again after 3 s; never; up, but an episode ended."""
-    skill = getup.GetupExam(within=3.0)
+    skill = skills.GetupExam(within=3.0)
     seen = recording(robot, skill.seconds, 6)
     at = {seconds: round(seconds / robot.dt) for seconds in (2.0, 3.0, 3.1)}
     seen.qpos[: at[2.0], 1, 2] = 0.1
@@ -174,7 +174,7 @@ def test_upright_is_by_gravity() -> None:
     seen = recording(machine(env), 1.0, 2)
     lean = math.radians(25.0) / 2
     seen.qpos[:, 1, 3:7] = [math.cos(lean), 0.0, math.sin(lean), 0.0]  # nose down, downhill: 35 degrees
-    assert getup.standing(machine(env), seen).mean(axis=0).tolist() == [1.0, 0.0]
+    assert skills.standing(machine(env), seen).mean(axis=0).tolist() == [1.0, 0.0]
 
 
 def test_handstand_rewards_and_judge() -> None:
@@ -185,7 +185,7 @@ def test_handstand_rewards_and_judge() -> None:
     env._refresh_base()
     torch.testing.assert_close(env._reward_stand_attitude(), torch.tensor([0.25, 1.0, 0.0]), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(env._reward_stand_height(), torch.tensor([math.exp(0.278 - 0.55), 1.0, 1.0]))
-    skill, here = handstand.HandstandExam(nose=-1.0, height=0.55, hands=["FR", "FL"]), machine(env)
+    skill, here = skills.HandstandExam(nose=-1.0, height=0.55, hands=["FR", "FL"]), machine(env)
     seen = recording(here, skill.seconds, 4)
     seen.qpos[:, :3, 2], seen.qpos[:, :3, 3:7] = 0.6, NOSE_DOWN
     seen.qpos[round(4.0 / here.dt), 1, 3:7] = [1.0, 0.0, 0.0, 0.0]  # at 4 s: 4 s before, 4 s after
@@ -207,13 +207,13 @@ def test_handstand_rewards_and_judge() -> None:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exams of a few robots and of a second."""
-    monkeypatch.setattr(getup.GetupExam, "robots", 3)
+    monkeypatch.setattr(skills.GetupExam, "robots", 3)
     monkeypatch.setattr(
-        getup.GetupExam, "grounds", {"plane": ExamGround(), "changed": ExamGround(slope=10.0, friction=0.3, load=2.0)}
+        skills.GetupExam, "grounds", {"plane": ExamGround(), "changed": ExamGround(slope=10.0, friction=0.3, load=2.0)}
     )
-    monkeypatch.setattr(getup, "SETTLING", 0.4)
-    monkeypatch.setattr(getup, "STAY", 0.2)
-    monkeypatch.setattr(strip, "PICTURES", 2)
+    monkeypatch.setattr(skills, "GETUP_SETTLING", 0.4)
+    monkeypatch.setattr(skills, "GETUP_STAY", 0.2)
+    monkeypatch.setattr(perform, "PICTURES", 2)
 
 
 def test_getup_from_training_to_deploy(tmp_path: Path, small: None) -> None:

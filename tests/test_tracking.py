@@ -14,8 +14,7 @@ from legged_mw.deploy.exam import run_skill
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval.perform import machine
-from legged_mw.eval.skill import PUSH_EVERY, ExamGround, Recording
-from legged_mw.eval.tracking import TrackingExam
+from legged_mw.eval.skills import PUSH_EVERY, ExamGround, Recording, TrackingExam
 from legged_mw.export.exporter import export
 from legged_mw.skills.clip import Clip, read_clip, save_clip
 from legged_mw.skills.motion_reference import angle_between

@@ -13,10 +13,10 @@ from program import SMALL, refused, run, trained
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_train import assert_equal
 
-from legged_mw.eval import training
+from legged_mw.eval import rollout
 from legged_mw.eval.exams import make_exam
-from legged_mw.eval.rollout import Record
-from legged_mw.eval.training import TrainingExam, training_figures
+from legged_mw.eval.figures import Record
+from legged_mw.eval.rollout import TrainingExam, training_figures
 from legged_mw.rl.run_folder import checkpoints
 from legged_mw.rl.runner import Runner
 from legged_mw.utils.task import load_task
@@ -96,8 +96,8 @@ def run_with(root: Path, interval: int) -> tuple[Path, dict[int, Any], dict[str,
 
 def test_exams_are_logged_and_leave_training_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Networks, normalisers, optimizer, counters and random state of every checkpoint are the same bits with exams and without."""
-    monkeypatch.setattr(training, "SECONDS", 0.5)
-    monkeypatch.setattr(training, "SETTLING", 0.2)
+    monkeypatch.setattr(rollout, "TRAINING_SECONDS", 0.5)
+    monkeypatch.setattr(rollout, "TRAINING_SETTLING", 0.2)
     _, plain, curves = run_with(tmp_path / "without", 0)
     assert not [name for name in curves if name.startswith("Exam/")]
     _, examined, curves = run_with(tmp_path / "with", 2)

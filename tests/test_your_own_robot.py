@@ -13,7 +13,7 @@ import pytest
 from program import Result, run
 
 from legged_mw import ROOT, programs
-from legged_mw.eval import exam, plots
+from legged_mw.eval import plots, rollout
 from legged_mw.robot import __main__ as robot_program
 from legged_mw.utils.task import load_task
 
@@ -56,7 +56,7 @@ def test_every_command_runs(
     mine = shutil.copyfile(DATA / file, robots / f"robot{Path(file).suffix}")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
     monkeypatch.setattr(
         programs, "grade_export", lambda *_: []
     )  # the exam on the other engine, in a process of its own

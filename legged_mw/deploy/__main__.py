@@ -16,7 +16,7 @@ from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import rules
+from legged_mw.eval import walking
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import check_folder, typed, writable
@@ -262,11 +262,11 @@ def examine(folder: Path, path: Path, common: bool = False, contact: str | None 
         print(skill.table(result))
     else:
         result = run_exam(folder, common=common, contact=contact, edited=edited)
-        print(rules.table(result))
+        print(walking.table(result))
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}
     try:
-        rules.save({**said, **result}, path)
+        walking.save({**said, **result}, path)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}; say --out FILE") from None
     print(f"written to {shown(path)}")

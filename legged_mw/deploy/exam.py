@@ -1,4 +1,4 @@
-"""The exams of an export, in MuJoCo's C engine. ``legged_mw.eval.rules`` has the walking exam, ``skill`` the others.
+"""The exams of an export, in MuJoCo's C engine. ``legged_mw.eval.walking`` has the walking exam, ``skills`` the others.
 
 A step is in the order of the environment's exams, so both give one result: sample, decide, push, move, check falls.
 """
@@ -17,10 +17,9 @@ from legged_mw.deploy.contract import CONTRACT_FILE, OWN, Contract, ContractErro
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import rules
-from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.eval.skill import ExamGround, ExamRobot, Recording, ReferenceMotion, Skill
-from legged_mw.eval.skills import make_skill
+from legged_mw.eval import walking
+from legged_mw.eval.skills import ExamGround, ExamRobot, Recording, ReferenceMotion, Skill, make_skill
+from legged_mw.eval.walking import ExamRules, in_common
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, unknown
@@ -49,11 +48,11 @@ def run_exam(
     wanted = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
-    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.exam
+    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
     stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact, edited=edited)
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
-    for step in range(round(rules.SECONDS / stage.dt)):
+    for step in range(round(walking.EXAM_SECONDS / stage.dt)):
         sampled["velocity"].append(stage.velocity())
         sampled["position"].append(stage.qpos()[:, :2])
         sampled["power"].append(np.abs(stage.measured.joint_torque * stage.measured.joint_vel).sum(axis=1))
@@ -146,11 +145,11 @@ def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
 
 def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
     """At step k of the pushes, add each push speed in direction k to the base's horizontal velocity, world frame."""
-    k = step - round(rules.PUSH_AT / stage.dt)
-    if 0 <= k < rules.PUSH_DIRECTIONS:
-        angle = 2 * math.pi * k / rules.PUSH_DIRECTIONS
+    k = step - round(walking.PUSH_AT / stage.dt)
+    if 0 <= k < walking.PUSH_DIRECTIONS:
+        angle = 2 * math.pi * k / walking.PUSH_DIRECTIONS
         for i, speed in enumerate(exam.push_speeds):
-            world = len(exam.held()) + i * rules.PUSH_DIRECTIONS + k
+            world = len(exam.held()) + i * walking.PUSH_DIRECTIONS + k
             stage.push(world, [speed * math.cos(angle), speed * math.sin(angle)])
 
 

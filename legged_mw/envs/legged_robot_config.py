@@ -154,7 +154,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         # offset: of the mean velocity; empty: offset on two feet, which sway, else error
         marks_of: Literal["", "error", "offset"] = ""
         push_mark: NonNegative = 0.0  # a walk survives all pushes of this speed [m/s]; 0: 1 on two feet, else 2
-        peer: str = ""  # go1, go2, g1: compare with its published policies of legged_mw/eval/peers.py; empty: none
+        peer: str = ""  # go1, go2, g1: compare with its published policies of resources/peers.yaml; empty: none
 
     def check(self) -> None:
         super().check()

@@ -1,21 +1,28 @@
-"""The table of exams, and the look-up of a task's exam. play.py and train.py use exams through this table only."""
+"""The table of exams, the look-up of a task's exam, and ``play.py --eval``: grade one policy or two, write the report."""
 
 from __future__ import annotations
 
+import argparse
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.eval import crossing, exam, perform, report, rules
-from legged_mw.eval.rollout import Policy
-from legged_mw.eval.rules import ExamRules
-from legged_mw.eval.skill import Skill
-from legged_mw.eval.skills import SKILLS
-from legged_mw.eval.training import TrainingExam
+from legged_mw.eval import perform, report, rollout, rough, walking
+from legged_mw.eval.report import Column
+from legged_mw.eval.rollout import Policy, TrainingExam
+from legged_mw.eval.skills import SKILLS, Skill
+from legged_mw.eval.walking import ExamRules, in_common
+from legged_mw.rl.policies import PolicySource, introduce, load_policy
+from legged_mw.rl.rsl_rl_settings import check_classes
+from legged_mw.sim.simulation import overflow_note
+from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import shown, unknown
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import LoadedTask
 
 
@@ -34,13 +41,15 @@ class Exam(NamedTuple):
     prepare: Callable[[LoadedTask], None]  # turns a task into the exam
     make_room: Callable[[LoadedTask], None]  # sets the number of worlds again, after the user's overrides
     ask_alike: Callable[[Sequence[LoadedTask]], None]  # grades all prepared tasks by the rules of the first
-    # (environment, policy, environment of the rough part or None) -> result, figures
-    examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]
+    # environment of the prepared task, policy -> result, figures
+    examine: Callable[[Any, Policy], tuple[dict[str, Any], dict[str, Any]]]
     rules: Callable[[LoadedTask], ExamRules | Skill]  # of a prepared task, also for another physics engine
     table: Callable[[dict[str, Any]], str]  # the result as text
-    write: Callable[..., None]  # the report: see report.write
+    write: Callable[[Path, str, Sequence[Column]], None]  # the report on a task's policies, into a folder
     in_training: Callable[[LoadedTask, str, bool], Examiner]  # task, device, eager
-    rough: ModuleType | None = None  # second part for rough terrain, with prepare, SETS, make_room and table
+    rough: ModuleType | None = (
+        None  # second part for rough terrain, with SETS, prepare, make_room, run_crossing and table
+    )
 
 
 def _skill(kind: str) -> Exam:
@@ -60,16 +69,16 @@ def _skill(kind: str) -> Exam:
 
 EXAMS = {
     "walking": Exam(
-        sets=lambda task: exam.SETS,
-        prepare=report.prepare,
-        make_room=report.make_room,
-        ask_alike=report.ask_alike,
-        examine=report.examine,
+        sets=lambda task: rollout.SETS,
+        prepare=rollout.prepare_report,
+        make_room=rollout.make_room,
+        ask_alike=rollout.ask_alike,
+        examine=rollout.examine,
         rules=lambda task: ExamRules.from_config(task.cfg),
-        table=rules.table,
+        table=walking.table,
         write=report.write,
         in_training=TrainingExam,
-        rough=crossing,
+        rough=rough,
     ),
     **{kind: _skill(kind) for kind in SKILLS},
 }
@@ -106,3 +115,109 @@ def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner
             print(f"no exam during training: the actor's observation group '{group}' has {sizes}")
             return None
     return examine
+
+
+# ---- ``play.py --eval``
+
+
+class Graded(NamedTuple):
+    """A policy and the tasks of its exam."""
+
+    source: PolicySource
+    trained: LoadedTask
+    task: LoadedTask
+    exam: Exam
+    crossing: LoadedTask | None  # the rough part of the exam, if there is one
+
+
+Elsewhere = Callable[[Graded], list[tuple[str, dict[str, Any]]]]  # results by name
+
+
+def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
+    """Grade policies, each with its trained config. Print their tables and write a report next to the first.
+
+    ``elsewhere`` grades the first policy again on another physics engine.
+    """
+    device = pick_device(args.device)
+    first, *rivals = policies
+    graded = [prepare(*first, args, common=args.ranges == "common"), *(prepare(*rival, args) for rival in rivals)]
+    graded[0].exam.ask_alike([each.task for each in graded])
+    introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
+    folder = graded[0].source.results(graded[0].task) / "eval"
+    writable(str(folder), "the report goes to", folder=True)
+    built = [(each, *build(each, args, device)) for each in graded]  # an error must come before a long exam
+    columns = [make_column(*each) for each in built]
+    columns[1:1] = [Column(name, {}, result) for name, result in elsewhere(graded[0])]
+    graded[0].exam.write(folder, graded[0].task.name, columns)
+    print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
+
+
+def prepare(source: PolicySource, trained: LoadedTask, args: argparse.Namespace, common: bool = False) -> Graded:
+    """The trained task with the overrides of the exam, then those of the user.
+
+    ``common``: use the one command range in which all published policies of the robot were measured.
+    """
+    task, exam = copy.deepcopy(trained), require_exam(trained)
+    exam.prepare(task)
+    override(task, args, exam.sets(task))
+    if common:
+        task.update({"exam": in_common(getattr(getattr(task.cfg, "exam", None), "peer", ""))}, where="--ranges common")
+    exam.make_room(task)  # after the user's overrides: they may change the ranges
+    return Graded(source, trained, task, exam, prepare_crossing(trained, args))
+
+
+def prepare_crossing(trained: LoadedTask, args: argparse.Namespace) -> LoadedTask | None:
+    """The rough part of the exam with the user's overrides; None if the policy trained on a plane."""
+    crossing = require_exam(trained).rough
+    if not crossing or trained.to_dict()["terrain"].get("mesh_type", "plane") == "plane":
+        return None
+    task = copy.deepcopy(trained)
+    crossing.prepare(task)
+    override(task, args, crossing.SETS)
+    crossing.make_room(task)  # after the user's overrides: they may change the kinds of terrain
+    return task
+
+
+def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None:
+    """Apply the user's overrides. Refuse an override of a field that the exam ``sets``."""
+    before = copy.deepcopy(task)
+    apply_overrides(task, args)
+    check_classes(task.train)
+    if touched := sets & task.changes_since(before).keys():
+        raise ConfigError(
+            f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam"
+        )
+
+
+def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, RobotTask, RobotTask | None]:
+    """Build the policy, the environment of the exam, and that of the rough part."""
+    task, rough = graded.task, graded.crossing
+    seed_everything(task.train.seed)
+    env = task.env_class(task.cfg, device, eager=args.eager)
+    ground = rough.env_class(rough.cfg, device, eager=args.eager) if rough else None
+    return load_policy(graded.source.checkpoint, env, task.train, device), env, ground
+
+
+def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask | None) -> Column:
+    """Run the exam and, if there is one, its rough part. Print their tables and return the report's column."""
+    source, exam = graded.source, graded.exam
+    result, figures = exam.examine(env, policy)
+    if rough and exam.rough:
+        figures["crossing"] = exam.rough.run_crossing(rough, policy)
+    name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"
+    print(f"\n{name}, {env.sim.engine} on {env.device}\n{exam.table(result)}\n")
+    if rough and exam.rough:
+        print(f"{exam.rough.table(figures['crossing'])}\n")
+    overrides = {path: now for path, (_, now) in graded.task.changes_since(graded.trained).items()}
+    about = {
+        "policy": "/".join(source.checkpoint.parts[-3:]),
+        "engine": env.sim.engine,
+        "device": env.device,
+        "overrides": overrides,
+    }
+    about |= (
+        {"warning": note}
+        if (note := " ".join(overflow_note(each.sim, "this exam") for each in (env, rough) if each).strip())
+        else {}
+    )
+    return Column(name, about, result, figures)

@@ -1,22 +1,19 @@
 """The report's figures from a record: numpy arrays in, plain numbers out. No simulator, no drawing.
 
 N worlds, T control steps, D joints, F feet. A world that fell is None and is left out of every mean here. The exam's
-means in ``rules`` count it. ``settled`` is the first control step after the exam's settling time.
+means in ``walking`` count it. ``settled`` is the first control step after the exam's settling time.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.rules import GRAVITY, PUSH_DIRECTIONS, SLOW
-
-if TYPE_CHECKING:
-    from legged_mw.eval.rollout import Record
+from legged_mw.eval.walking import GRAVITY, PUSH_DIRECTIONS, SLOW
 
 SATURATED = 0.98  # share of the limit: a larger torque counts as saturated
 STRAY = 0.3  # share of the step: tolerance for being at its start or at its end
@@ -24,6 +21,24 @@ SHORT_SWING = 2  # [control steps] shortest swing; a shorter time in the air is 
 BINS = 40  # of a joint's histogram
 
 Array = NDArray[Any]
+
+
+class Record(NamedTuple):
+    """N worlds over T control steps. Signals are sampled before each step, so the first sample is the start state."""
+
+    dt: float  # [s] control step
+    mass: float  # [kg]
+    commands: Array  # (T, N, C)
+    fell_at: Array  # (N,) control step of the first fall, or inf; later samples are of another episode
+    last_position: Array  # (N, 2) [m] of the base after the last step
+    signals: dict[str, Array]  # name -> (T, N, ...)
+
+    def part(self, worlds: slice) -> Record:
+        """The record of a range of worlds."""
+        signals = {name: values[:, worlds] for name, values in self.signals.items()}
+        return Record(
+            self.dt, self.mass, self.commands[:, worlds], self.fell_at[worlds], self.last_position[worlds], signals
+        )
 
 
 # ---- following the command
@@ -224,3 +239,72 @@ def plain(values: Array) -> list[Any]:
     if values.ndim > 1:
         return [plain(row) for row in values]
     return [float(v) if math.isfinite(v) else None for v in values]
+
+
+# ---- motors: torque against speed of each kind of joint, inside the torque-speed envelope
+
+
+MOTOR_BINS = (40, 32)  # of speed and torque
+NEAR = 0.02  # share of the highest torque: a sample this close to the envelope counts as at the limit
+MARGIN = 1.08  # size of the plot relative to samples and envelope
+
+
+class MotorLimits(NamedTuple):
+    """The motors' limits, each (D,); infinite where unknown."""
+
+    low: Array  # [N m]
+    high: Array  # [N m]
+    stall_torque: Array  # [N m]
+    no_load_speed: Array  # [rad/s]
+
+    def at(self, speed: Array) -> tuple[Array, Array]:
+        """Lowest and highest torque at ``speed`` (..., D)."""
+        share = speed / self.no_load_speed
+        return np.maximum(self.low, -self.stall_torque * (1.0 + share)), np.minimum(
+            self.high, self.stall_torque * (1.0 - share)
+        )
+
+    def of(self, joint: int) -> MotorLimits:
+        """The limits of one joint, each (1,)."""
+        return MotorLimits(*(values[joint : joint + 1] for values in self))
+
+
+def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorLimits) -> list[dict[str, Any]]:
+    """For each kind of joint: a histogram of torque and speed, the motor's envelope, and the share of time at it.
+
+    ``kinds`` (D,): joints of the same kind share a plot and must have equal motors. Worlds that fell are left out.
+    """
+    stood = np.isinf(record.fell_at)
+    torque, speed = (record.signals[name][settled:, stood].astype(float) for name in ("torque", "motor_speed"))
+    low, high = limits.at(speed)
+    most = np.minimum(limits.high, limits.stall_torque)
+    near = np.where(np.isfinite(most), NEAR * most, 0.0)
+    at_limit = (torque >= high - near) | (torque <= low + near)
+    found = []
+    for kind in dict.fromkeys(kinds):
+        joints = [i for i, name in enumerate(kinds) if name == kind]
+        drawn = {
+            "kind": kind,
+            **_picture(torque[..., joints].ravel(), speed[..., joints].ravel(), limits.of(joints[0])),
+        }
+        known = bool(np.isfinite(most[joints]).all()) and stood.any()
+        found.append({**drawn, "at_limit": float(at_limit[..., joints].mean()) if known else None})
+    return found
+
+
+def _picture(torque: Array, speed: Array, limits: MotorLimits) -> dict[str, Any]:
+    """The counts of samples on a grid of speed and torque, and the envelope over the same speeds."""
+    free = float(limits.no_load_speed[0])
+    widest = max(float(np.abs(speed).max(initial=1.0)), min(free, 1e3) if np.isfinite(free) else 0.0) * MARGIN
+    strong = float(np.minimum(limits.high, limits.stall_torque)[0])
+    highest = max(float(np.abs(torque).max(initial=1.0)), strong if np.isfinite(strong) else 0.0) * MARGIN
+    counts, speeds, torques = np.histogram2d(speed, torque, MOTOR_BINS, [[-widest, widest], [-highest, highest]])
+    line = np.linspace(-widest, widest, 97)
+    low, high = (np.clip(side, -highest, highest).round(4).tolist() for side in limits.at(line))
+    bounded = bool(np.isfinite(strong))
+    return {
+        "speeds": speeds.round(4).tolist(),
+        "torques": torques.round(4).tolist(),
+        "counts": counts.T.astype(int).tolist(),  # (torque, speed)
+        "envelope": {"speed": line.round(4).tolist(), "low": low, "high": high} if bounded else None,
+    }

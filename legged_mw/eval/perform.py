@@ -6,6 +6,7 @@ import copy
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -14,16 +15,15 @@ import torch
 from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.eval import exam, skill_page
-from legged_mw.eval.page import Column
+from legged_mw.eval import rollout
+from legged_mw.eval.report import Column, skill_page
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.skill import ExamGround, ExamRobot, Recording, ReferenceMotion, Skill, Starts
-from legged_mw.eval.skills import make_skill
+from legged_mw.eval.skills import ExamGround, ExamRobot, Floats, Recording, ReferenceMotion, Skill, Starts, make_skill
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
 from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.errors import UserError
-from legged_mw.utils.task import LoadedTask, load_task
+from legged_mw.utils.task import LoadedTask
 
 NOMINAL: dict[str, Any] = {
     **{f"domain_rand.{name}": [] for name in KINDS},
@@ -40,7 +40,7 @@ def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
 def overrides(task: LoadedTask) -> dict[str, Any]:
     """The exam's changes to the config. Fields that the task lacks are left out."""
     # keep the task's own termination rules
-    common = {path: value for path, value in exam.OVERRIDES.items() if not path.startswith("termination.")}
+    common = {path: value for path, value in rollout.OVERRIDES.items() if not path.startswith("termination.")}
     wanted, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
     return {path: value for path, value in wanted.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
 
@@ -63,7 +63,7 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
         task.update({"exam": tasks[0].to_dict()["exam"]} if "exam" in tasks[0].to_dict() else {}, where="--compare")
 
 
-def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+def examine(kind: str, env: RobotTask, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     """The result and the pictures of the exam.
 
     ``env`` comes from a prepared task and has the first ground. Each further ground builds another environment.
@@ -80,8 +80,6 @@ def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tu
 
 def _draw(env: RobotTask, strips: Mapping[str, np.ndarray]) -> dict[str, bytes]:
     """A picture of each robot, or none on a machine that cannot draw."""
-    from legged_mw.eval.strip import strip  # imports OpenGL
-
     try:
         return {name: strip(env, qpos) for name, qpos in strips.items()}
     except UserError as error:
@@ -150,21 +148,19 @@ def perform(
 
 
 class InTraining:
-    """The first part of the exam during training. ``training.TrainingExam`` does the same for the walking exam."""
+    """The first part of the exam during training. ``rollout.TrainingExam`` does the same for the walking exam."""
 
     def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
-        copied = load_task(str(task.path))
-        copied.update(task.to_dict(), where="training")
-        copied.exam = task.exam
+        copied = rollout.copy_of(task)
         prepare(copied)
-        self.skill, self._generators = skill_of(copied.cfg, copied.exam), [device] if device.startswith("cuda") else []
-        with torch.random.fork_rng(self._generators):
+        self.skill = skill_of(copied.cfg, copied.exam)
+        with rollout.keep_random_state(device):
             self.env = copied.env_class(copied.cfg, device, eager=eager)
         self._starts = self.skill.starts(machine(self.env), self.env.num_envs)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """The figures of ``first_part``."""
-        with torch.random.fork_rng(self._generators):
+        with rollout.keep_random_state(self.env.device):
             return first_part(self.env, policy, self.skill, self._starts)
 
 
@@ -186,16 +182,41 @@ def of_result(result: Mapping[str, Any]) -> Skill:
     )
 
 
-def write(
-    folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
-) -> None:
+def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     """Write ``report.json`` and ``report.html``; see ``report.write``."""
-    columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)
     content = {"task": task, "columns": [{**column._asdict(), "figures": None} for column in columns]}
     (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     strips = (columns[0].figures or {}).get("strips", {})
     for name, picture in strips.items():
         (folder / f"{name}.png").write_bytes(picture)
-    page = skill_page.html(task, of_result(columns[0].exam), columns, strips)
+    page = skill_page(task, of_result(columns[0].exam), columns, strips)
     (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+# ---- a picture strip of one robot, from left to right in time
+
+
+PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, pictures per row, [px] of each
+
+
+def strip(env: RobotTask, qpos: Floats) -> bytes:
+    """A PNG of the robot at PICTURES times, evenly spaced over ``qpos`` (T, nq). Raises ViewError if drawing fails."""
+    from legged_mw.drawing.scene import visual_spec
+    from legged_mw.view.recorder import RobotRenderer  # imports OpenGL
+    from legged_mw.view.stage import Moment
+    from legged_mw.view.video import contact_sheet, save_png
+
+    renderer, none = RobotRenderer(visual_spec(env.robot, env.cfg.viewer.camera), WIDTH, HEIGHT), np.zeros((1, 3))
+    frames = []
+    for step in np.linspace(0, len(qpos) - 1, PICTURES).round().astype(int):
+        lines = ((f"{step * env.dt:.1f} s", ""),)
+        there = np.concatenate([qpos[0, :2], qpos[step, 2:]])  # keep x and y at the start, in view of the camera
+        moment = Moment(
+            step * env.dt, there[None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines
+        )
+        frames.append(renderer.frame(moment))
+    renderer.close()
+    with TemporaryDirectory() as folder:
+        save_png(path := Path(folder) / "strip.png", contact_sheet(frames, COLUMNS))
+        return path.read_bytes()

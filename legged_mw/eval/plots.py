@@ -24,10 +24,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from legged_mw.eval import estimate_panel
-from legged_mw.eval.motors import draw as draw_motor
-from legged_mw.eval.peers import best_of
-from legged_mw.eval.rules import AXES, ExamRules
+from legged_mw.eval.walking import AXES, ExamRules, best_of
 
 Figures = dict[str, Any]
 Columns = list[tuple[str, Figures]]  # (name, figures) of one or two policies
@@ -320,9 +317,30 @@ def _estimates(columns: Columns) -> list[PlotPanel]:
     panels = []
     for i, (name, figures) in enumerate(columns):
         for k in range(2 if "estimate" in figures else 0):
-            draw = partial(estimate_panel.draw, figures["estimate"], k, (INK, PAIR[i], FAINT), _of(name, columns))
-            panels.append(PlotPanel(draw, estimate_panel.WIDTH, estimate_panel.HEIGHT))
+            draw = partial(_estimate, figures["estimate"], k, PAIR[i], _of(name, columns))
+            panels.append(PlotPanel(draw, width=7.2, height=2.1))
     return panels
+
+
+def _estimate(estimate: Figures, k: int, colour: str, suffix: str, ax: Axes) -> None:
+    """Plot axis ``k`` of ``figures.estimates``, with the commands side by side."""
+    commands, seconds = estimate["commands"], estimate["seconds"]
+    for key, tone, label in (("truth", INK, "true"), ("estimate", colour, "estimated")):
+        values = np.array(estimate[key][k], dtype=float).reshape(len(commands), -1)
+        time = np.linspace(0.0, seconds, values.shape[1]) + seconds * np.arange(len(commands))[:, None]
+        apart = ((0, 0), (0, 1))  # NaN: no line from one command to the next
+        lines = (np.pad(rows, apart, constant_values=np.nan).ravel() for rows in (time, values))
+        ax.plot(*lines, color=tone, linewidth=1.0, label=label)
+    for i in range(1, len(commands)):
+        ax.axvline(i * seconds, color=FAINT, linewidth=0.8)
+    places = (np.arange(len(commands)) + 0.5) * seconds
+    ax.set_xticks(
+        places, [", ".join(f"{value:.2g}" for value in command) for command in commands], rotation=90, fontsize=5.5
+    )
+    name, unit = AXES[k]
+    ax.set(title=f"{name} [{unit}]{suffix}", xlabel="command: vx, vy, yaw rate", xlim=(0.0, seconds * len(commands)))
+    ax.grid(False, axis="x")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, ncols=2, handlelength=1.6)
 
 
 # ---- gait
@@ -388,11 +406,32 @@ def _motor_panels(columns: Columns) -> list[PlotPanel]:
     rows = zip_longest(
         *([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns)
     )
-    return [
-        PlotPanel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix))
-        for row in rows
-        for suffix, motor in filter(None, row)
-    ]
+    return [PlotPanel(partial(_motor, motor, suffix)) for row in rows for suffix, motor in filter(None, row)]
+
+
+def _motor(motor: Figures, suffix: str, ax: Axes) -> None:
+    """Plot the torque against the speed of one kind of joint."""
+    counts, speeds, torques = (np.array(motor[key], dtype=float) for key in ("counts", "speeds", "torques"))
+    # only cells with samples: a full mesh would make a page of megabytes
+    rows, columns = np.nonzero(counts)
+    often = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
+    ax.bar(
+        speeds[columns],
+        np.diff(torques)[0],
+        np.diff(speeds)[0],
+        torques[rows],
+        align="edge",
+        color=colormaps[HEAT](1.0 - often),
+        linewidth=0,
+    )
+    if motor["envelope"]:
+        for side in ("low", "high"):
+            ax.plot(motor["envelope"]["speed"], motor["envelope"][side], color=INK, linewidth=1.2)
+    share = motor["at_limit"]
+    ax.set(title=f"{motor['kind'].replace('_', ' ')}{suffix}", xlabel="speed [rad/s]", ylabel="torque [N m]")
+    ax.set_title(
+        "no limit known" if share is None else f"{share:.1%} at the limit", loc="right", color=MUTED, fontsize=7.0
+    )
 
 
 # ---- pushes

@@ -1,139 +1,330 @@
-"""The report on one or two policies: run the exam, gather the figures, write ``report.json``, ``report.html``, PNGs."""
+"""The report as one self-contained HTML page, with JSON and pictures beside it, from results and figures."""
 
 from __future__ import annotations
 
+import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from html import escape
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
+from legged_mw.eval.walking import AXES, LEVELS, PUSH_DIRECTIONS, ExamRules, Figure, best_of, verdicts
 
-from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam, figures, motors, page, rules
-from legged_mw.eval.page import Column
-from legged_mw.eval.peers import best_of
-from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
-from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
-from legged_mw.sim.joints import family
-from legged_mw.sim.servos import CURVE
-from legged_mw.utils.task import LoadedTask
+if TYPE_CHECKING:
+    from legged_mw.eval.plots import Section
+    from legged_mw.eval.skills import Skill
 
-GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # [s] of each command in the gait diagram and in the estimator's plot
-BEFORE_STEP = 0.5  # [s] before the step in the plot of a step response
-
-SIGNALS: dict[str, Signal] = {
-    **exam.SIGNALS,
-    "contact": lambda env: env.foot_contact,  # (N, F)
-    "dof_pos": lambda env: env.dof_pos,  # (N, D) [rad]
-    "dof_vel": lambda env: env.dof_vel,  # (N, D) [rad/s]
-    "torque": lambda env: env.torques,  # (N, D) [N m], one simulation step old
-    "motor_speed": lambda env: env.sim.actuator_velocity(),  # (N, D) [rad/s], of the same moment as the torque
-    "reward": lambda env: env.episode_sums,  # (N, K), sum of scale * term * dt since the start
+CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
+TEXTS = {
+    "crossing": "Commanded ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
+    "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
+    "ground; below it stands what makes it hard, level by level. Dark is good.",
+    "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
+    "range that was trained. Dark is good. {stroke}A cross is a fall.",
+    "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
+    "robots, each in another phase of its gait at the step; band: lowest and highest of them. One that fell is not among them.",
+    "estimate": "What the policy believes of its velocity, body frame at the IMU, beside what the simulator knows: the last "
+    "two seconds of each command, side by side. The exam's table has the root mean square of the difference over the last 8 of 10 seconds.",
+    "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the duty factor: "
+    "the share of time that a foot is down, mean over the feet.",
+    "joints": "Where the joints are, how fast they move and what torque they need over all commands without a fall. Upright strokes are "
+    "limits: soft position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond "
+    "a limit (of a torque: at 98 % of it or more), where there are any.",
+    "motors": "Torque against speed of each kind of joint over all commands without a fall: the more often, the darker. The lines are the "
+    "motor's envelope: its force limit, and its torque-speed curve if control.actuator has one. Above: the share of samples at the "
+    "envelope, by 2 % of the highest torque.",
+    "pushes": "The base's horizontal velocity jumps; a push is survived if the robot has not fallen three seconds later. Rings: jumps "
+    "of {speeds} m/s, from the inside; sectors: where it is pushed to. Coloured tiles were survived. Walking is at {vx:g} m/s; the exam "
+    "counts these.",
+    "energy": "Straight ahead and backwards. Power: sum over the joints of |torque x speed|. Cost of transport: energy over weight "
+    "times distance.",
+    "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the commands without a fall.",
 }
+EXAM_NOTE = (
+    "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise; {asked}. A command at which the robot falls "
+    "counts with the error of standing still. A policy walks if it passes every row that has a mark. {peer}"
+)
+STROKE = "The stroke on each scale is what the exam allows on average. "
 
 
-def prepare(task: LoadedTask) -> None:
-    """Turn ``task`` into the exam with the extra worlds of the report."""
-    exam.prepare(task)
-    make_room(task)
+class Column(NamedTuple):
+    """One policy in one physics engine: a column of the tables."""
+
+    name: str
+    about: dict[str, Any]  # policy, engine, device, overrides; a warning if contact buffers overflowed
+    exam: dict[str, Any]  # the result of ``ExamRules.grade``
+    figures: dict[str, Any] | None = None  # None: exam result only, such as on another physics engine
 
 
-def make_room(task: LoadedTask) -> None:
-    """Set the number of worlds of the report. It depends on the command ranges."""
-    task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
-
-
-def ask_alike(tasks: Sequence[LoadedTask]) -> None:
-    """Grade all prepared tasks by the rules of the first, also those with other trained ranges."""
-    first, *others = (rules.ExamRules.from_config(task.cfg) for task in tasks)
-    for task, own in zip(tasks[1:], others, strict=True):
-        if own != first:
-            task.update({"exam": first.to_mapping()}, where="--compare")
-            make_room(task)
-
-
-def examine(
-    env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The exam's result and the report's figures, from one roll-out in the environment of a prepared task.
-
-    ``rough``: the environment of the rough part, prepared by ``crossing``; its result joins the figures.
-    """
-    plan, asked = make_plan(env.cfg, env.dt), rules.ExamRules.from_config(env.cfg)
-    record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=asked.worlds())
-    gathered = gather(env, asked, plan, record)
-    if rough:
-        gathered["crossing"] = crossing.run_crossing(rough, policy)
-    return exam.grade(asked, record.part(slice(asked.worlds()))), gathered
-
-
-def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record) -> dict[str, Any]:
-    """All figures of the report beside the exam's result, as plain numbers."""
-    parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
-    settled, until = round(rules.SETTLING / env.dt), round(rules.PUSH_UNTIL / env.dt)
-    held, axes, first = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
-    # first index of the grid's row with vy nearest to 0
-    straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])
-    ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
-    return {
-        "joint_names": list(env.robot.joint_names),
-        "foot_names": list(env.foot_names),
-        "dt": env.dt,
-        "tracking": {
-            "axes": axes,
-            "vx_yaw": figures.tracking_errors(parts["vx_yaw"], settled, len(axes["yaw"])),
-            "vx_vy": figures.tracking_errors(parts["vx_vy"], settled, len(axes["vy"])),
-        },
-        "steps": {name: figures.responses(parts[f"step_{name}"], i, first) for i, name in enumerate(NAMES)},
-        "gait": figures.gaits(held, settled, asked.commands(), GAIT_SECONDS),
-        **(
-            {"estimate": figures.estimates(held, asked.commands(), ESTIMATE_SECONDS)}
-            if "estimate" in held.signals
-            else {}
-        ),
-        "joints": figures.joints(held, settled, joint_limits(env)),
-        "motors": motors.envelopes(held, settled, [family(name) for name in env.robot.joint_names], motor_limits(env)),
-        "pushes": {
-            "speeds": list(asked.push_speeds),
-            "walking": figures.survival(parts["pushes"].fell_at, until),
-            "standing": figures.survival(parts["standing_pushes"].fell_at, until),
-        },
-        "transport": {"vx": axes["vx"], **figures.transport(ahead, settled)},
-        "reward": figures.reward_shares(held, settled, env.reward_names),
+def walking_page(
+    task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]
+) -> str:
+    """The whole page. ``rules``: those of the first column."""
+    words: dict[str, Any] = {
+        "speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)),
+        "vx": rules.push_vx,
     }
+    words["stroke"] = STROKE if rules.marks_of == "error" else ""
+    chapters = [
+        _chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns))
+        for section, panels in drawn
+    ]
+    note = EXAM_NOTE.format(
+        pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, asked=rules.asked_words(), peer=escape(rules.peer_words())
+    )
+    results = [column.exam for column in columns]
+    figures = [rules.figures(result, others=results) for result in results]
+    header = f"""{_names(columns, rules)}{_cards(figures[0])}</header>
+<section><h2>Exam</h2><p class="lead">{note}</p>{exam_table(columns, figures, rules.peer_label)}</section>"""
+    published = _published(rules, columns) if len(rules.peers) > 1 else ""
+    return _page(task, "walking exam", "Walking exam", f"{header}\n{''.join(chapters)}{published}", columns)
 
 
-def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
-    """Signal -> (low, high), each (D,): soft position limits, speed limits (infinite if unknown), torque limits."""
-    speeds = np.array(env.robot.speed_limits)
-    position = torch.stack([env.soft_lower, env.soft_upper]).cpu().numpy().astype(float)
-    effort = env.robot.effort_range.T
-    return {"dof_pos": (position[0], position[1]), "dof_vel": (-speeds, speeds), "torque": (effort[0], effort[1])}
+def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]) -> str:
+    """The frame of a page. ``body`` begins inside of the header, below the task's name, and closes it."""
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark"><title>{escape(task)}: {escape(exam)}</title><style>{CSS}</style></head>
+<body><main>
+<header><p class="above">{escape(above)}</p><h1>{escape(task)}</h1>{body}
+<footer>{about(columns)}</footer>
+</main></body></html>
+"""
 
 
-def motor_limits(env: LeggedRobot) -> motors.MotorLimits:
-    """Force limits and torque-speed curves; infinite if unknown."""
-    curve = (np.array(env.robot.tables.get(name, [np.inf] * env.num_actions)) for name in CURVE)
-    return motors.MotorLimits(*env.robot.effort_range.T, *curve)
+def _names(columns: Sequence[Column], rules: ExamRules) -> str:
+    """The graded policies in the colours of their curves, with pass or fail."""
+    items, drawn = [], [column.name for column in columns if column.figures]
+    for column in columns:
+        swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
+        engine = escape(str(column.about.get("engine", "")))
+        pills = [pill(*_said(words), yes) for words, yes in verdicts(rules, column.exam)]
+        items.append(
+            f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>"
+        )
+    return f'<ul class="names">{"".join(items)}</ul>'
 
 
-def write(
-    folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
-) -> None:
+def _said(words: str) -> tuple[str, str]:
+    """The words for true and for false of a verdict such as ``walks``."""
+    verb, _, rest = words.partition(" ")
+    return words, f"does not {verb.removesuffix('s')} {rest}".strip()
+
+
+def pill(good: str, bad: str, yes: bool) -> str:
+    return (
+        f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {good if yes else bad}</span>'
+    )
+
+
+def _cards(figures: Sequence[Figure]) -> str:
+    """Cards with the most important figures."""
+    cards = []
+    for figure in figures:
+        if figure.card:
+            title, unit = figure.card
+            value = (
+                f"{figure.value:.0%}"
+                if figure.more_is_better and figure.value is not None
+                else figure.text(figure.value)
+            )
+            cards.append(
+                f'<div class="card{_mood(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>'
+            )
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _mood(figure: Figure) -> str:
+    return {True: " pass", False: " fail", None: ""}[figure.passes()]
+
+
+def exam_table(
+    columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str, asks: str = "walks at"
+) -> str:
+    """A table with one row per figure. Later columns also show the gap to the first column."""
+    lines = []
+    for first, *others in zip(*figures, strict=True):
+        cells = [f'<td><span class="value{_mood(first)}">{first.text(first.value)}</span></td>']
+        for other in others:
+            gap = "" if other.value is None or first.value is None else f"{other.value - first.value:+.{first.digits}f}"
+            gap = gap if gap.strip("+-0.") else ""
+            cells.append(
+                f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>'
+            )
+        cells.append(f"<td>{first.mark_text()}</td>")
+        if peer:
+            cells.append(f"<td>{first.peer_text()}</td>")
+        sub = ' class="sub"' if first.name.startswith(" ") else ""
+        lines.append(f"<tr{sub}><th>{escape(first.name.strip())}</th>{''.join(cells)}</tr>")
+    heads = "".join(
+        f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), asks, *([peer] if peer else [])]
+    )
+    head = f"<thead><tr><th></th>{heads}</tr></thead>"
+    return f'<div class="scroll"><table class="exam">{head}<tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
+    """A table with one row per policy: the graded policies, then the published ones."""
+    peers = [(peer.name, peer.figures, f"{peer.asked['push_vx']:g}") for peer in rules.peers]
+    rows = [(column.name, column.exam, f"{rules.push_vx:g}") for column in columns]
+    heads = [
+        "",
+        "falls",
+        "error vx, vy, yaw rate",
+        "worst",
+        "offset",
+        "drift [m]",
+        "cost of transport",
+        "pushes survived [%]",
+        "at vx [m/s]",
+    ]
+    cells = []
+    for name, found, vx in [*rows, *peers]:
+        digits = {"error": 3, "worst": 2, "offset": 3}
+        triples = [", ".join(f"{value:.{each}f}" for value in found[key]) for key, each in digits.items()]
+        drift = "fell" if found["drift"] is None else f"{found['drift']:.3f}"
+        cost = "none" if found["cost_of_transport"] is None else f"{found['cost_of_transport']:.2f}"
+        shares = ", ".join(f"{100 * share:.0f}" for share in found["pushes"].values())
+        cells.append([name, str(found["falls"]), *triples, drift, cost, shares, vx])
+    pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
+    lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
+    return (
+        f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{table(heads, cells)}</section>'
+    )
+
+
+def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
+    figures = "".join(f"<figure>{svg}</figure>" for svg in panels)
+    kind = "wide" if section.across == 1 else "half" if section.panels[0].width > 4.0 else f"by{section.across}"
+    text = f'<h2>{section.title}</h2><p class="lead">{lead}</p>'
+    return f'<section>{text}<div class="panels {kind}">{figures}</div>{extra}</section>'
+
+
+def _extra(name: str, columns: Sequence[Column]) -> str:
+    """The table below a section's plots; two policies alternate row by row."""
+    drawn = [column for column in columns if column.figures]
+    figures: dict[str, Any] = drawn[0].figures or {}
+    tables = {
+        "crossing": (_crossing_rows, ["", *(f"level {i}" for i in range(LEVELS)), "mean"], "Every share"),
+        "steps": (_step_rows, ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], ""),
+        "gait": (
+            _gait_rows,
+            ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in figures["foot_names"])],
+            "All commands",
+        ),
+        "joints": (_joint_rows, ["", "position", "velocity", "torque"], "Share beyond the limit, joint by joint"),
+    }
+    if name not in tables:
+        return ""
+    make, heads, folded = tables[name]
+    # zip_longest, because the policies' command ranges may differ
+    paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))
+    return table(heads, [row for rows in paired for row in rows if row], folded)
+
+
+def _crossing_rows(column: Column, whose: str) -> list[list[str]]:
+    rows = []
+    for name, kind in (column.figures or {}).get("crossing", {"kinds": {}})["kinds"].items():
+        for which in ("crossed", "fell"):
+            shares = [*kind[which], fmean(kind[which])]
+            rows.append([f"{name.replace('_', ' ')}, {which}{whose}", *(f"{share:.1%}" for share in shares)])
+    return rows
+
+
+def _step_rows(column: Column, whose: str) -> list[list[str]]:
+    rows = []
+    for name, unit in AXES:
+        for number in (column.figures or {})["steps"][name.removesuffix(" rate")]["numbers"]:
+            rise, over, left = number["rise_time"], number["overshoot"], number["left"]
+            rose = "not reached" if rise is None else f"{rise:.2f}"
+            rest = ["" if over is None else f"{over:.0%}", "" if left is None else f"{left:+.3f}"]
+            rows.append([f"{name} [{unit}]{whose}", f"{number['from']:g}", f"{number['to']:g}", rose, *rest])
+    return rows
+
+
+def _gait_rows(column: Column, whose: str) -> list[list[str]]:
+    rows = []
+    for gait in (column.figures or {})["gait"]:
+        name = ", ".join(f"{v:g}" for v in gait["command"]) + whose
+        strides, duty = gait["stride_frequency"], gait["duty_factor"]
+        rows.append([name, "fell"] if duty is None else [name, f"{strides:.2f}", *(f"{share:.0%}" for share in duty)])
+    return rows
+
+
+def _joint_rows(column: Column, whose: str) -> list[list[str]]:
+    rows = []
+    for i, joint in enumerate((column.figures or {})["joint_names"]):
+        shares = [(column.figures or {})["joints"][key]["saturated"] for key in ("dof_pos", "dof_vel", "torque")]
+        cells = ["" if not each else "no limit known" if each[i] is None else f"{each[i]:.2%}" for each in shares]
+        rows.append([joint.removesuffix("_joint") + whose, *cells])
+    return rows
+
+
+def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
+    """A table. With the title ``folded`` the reader unfolds it."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join(
+        f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows
+    )
+    drawn = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f"<details><summary>{folded}</summary>{drawn}</details>" if folded else drawn
+
+
+def about(columns: Sequence[Column]) -> str:
+    """The policies, their physics engines and devices, and the overrides."""
+    parts = []
+    for column in columns:
+        about: dict[str, Any] = column.about
+        changed = about.get("overrides") or {}
+        listed = "".join(
+            f"<li><code>{escape(path)}</code> {escape(str(value))}</li>" for path, value in sorted(changed.items())
+        )
+        where = ", ".join(str(about[key]) for key in ("policy", "engine", "device") if about.get(key))
+        fields = (
+            f"<details><summary>Config fields that differ from training</summary><ul>{listed}</ul></details>"
+            if listed
+            else ""
+        )
+        warning = f"<p><b>{escape(str(about['warning']))}</b></p>" if about.get("warning") else ""
+        parts.append(f"<p><b>{escape(column.name)}</b> {escape(where)}</p>{warning}{fields}")
+    return "".join(parts)
+
+
+# ---- the page of a skill exam
+
+
+def skill_page(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str, bytes]) -> str:
+    """The whole page. ``strips``: part -> PNG of a robot that failed, else of the slowest robot."""
+    passed = [f"<li><b>{escape(c.name)}</b> {pill('passes', 'does not pass', c.exam['passed'])}</li>" for c in columns]
+    sections = []
+    for part in skill.grounds:
+        figures = [skill.figures(column.exam["parts"], part) for column in columns]
+        strip = picture(strips[part], part) if part in strips else ""
+        sections.append(f"<section><h2>{escape(part)}</h2>{exam_table(columns, figures, '', 'asks')}{strip}</section>")
+    header = f'<ul class="names">{"".join(passed)}</ul></header>\n<p class="lead">{escape(skill.asks)}</p>'
+    return _page(task, skill.kind, f"Exam: {skill.kind}", header + "".join(sections), columns)
+
+
+def picture(png: bytes, name: str) -> str:
+    """The HTML of one picture strip."""
+    return f'<p><img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt="{escape(name)}" style="max-width:100%"></p>'
+
+
+# ---- files
+
+
+def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     """Write ``report.json``, one PNG per section and the self-contained ``report.html``.
 
     Every column is compared with the first, by the rules of the first. At most two columns have figures.
-    ``extras``: further exam results by name, such as the first policy's on another physics engine. The exam's table
-    shows their gap to the first column.
     """
     from legged_mw.eval import plots  # matplotlib takes a second to import
 
-    columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)
-    asked = rules.ExamRules.from_mapping(columns[0].exam["rules"])
+    asked = ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column._asdict() for column in columns]}
     if asked.peers:
         content |= {"peer": best_of(asked.peers), "peers": [peer._asdict() for peer in asked.peers]}
@@ -143,7 +334,7 @@ def write(
         plots.write_png(section, folder / f"{section.name}.png")
     _write_text(
         folder / "report.html",
-        page.html(task, asked, columns, [(section, plots.svgs(section)) for section in sections]),
+        walking_page(task, asked, columns, [(section, plots.svgs(section)) for section in sections]),
     )
 
 

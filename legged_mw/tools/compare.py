@@ -9,7 +9,7 @@ from html import escape
 from itertools import groupby
 from pathlib import Path
 
-from legged_mw.eval.page import CSS, table
+from legged_mw.eval.report import CSS, table
 from legged_mw.tools.curves import Run, differences, find_runs
 from legged_mw.utils.cli import Parser
 from legged_mw.utils.errors import UserError, shown

@@ -9,9 +9,9 @@ import torch
 from program import SMALL
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, perform, rollout
-from legged_mw.eval.page import Column, about
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval import perform, rollout
+from legged_mw.eval.report import Column, about
+from legged_mw.eval.walking import ExamRules
 from legged_mw.export import replay as export_replay
 from legged_mw.sim.mujoco_engine import MujocoSimulation
 from legged_mw.sim.simulation import overflow_note
@@ -40,7 +40,7 @@ def still(obs: Any) -> torch.Tensor:
 
 
 def test_the_exam_says_it(env: LeggedRobot, capsys: pytest.CaptureFixture[str]) -> None:
-    cases = exam.cases(ExamRules.from_config(env.cfg), env.dt, 0.0)[:4]
+    cases = rollout.cases(ExamRules.from_config(env.cfg), env.dt, 0.0)[:4]
     rollout.roll_out(env, still, cases, 2, {})  # type: ignore[arg-type]
     assert f"WARNING: this exam {NOTE}\n" == capsys.readouterr().out
 

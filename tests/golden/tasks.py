@@ -18,9 +18,9 @@ from golden.table import Table
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.mirror import Mirror
-from legged_mw.eval.crossing import make_room
 from legged_mw.eval.exams import find_exam, require_exam
-from legged_mw.eval.rules import ExamRules, in_common
+from legged_mw.eval.rough import make_room
+from legged_mw.eval.walking import ExamRules, in_common
 from legged_mw.rl.policies import PolicySource, Trained, find_rival
 from legged_mw.rl.ranks import Rank, rank_device
 from legged_mw.rl.rsl_rl_settings import mirror

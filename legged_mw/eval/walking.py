@@ -1,7 +1,7 @@
-"""The rules of the walking exam: its commands, measures and pass marks. Needs numpy, but neither torch nor warp.
+"""The walking exam: its commands, measures, pass marks and verdict. Needs numpy, but neither torch nor warp.
 
-``exam`` applies them in the training environment, ``legged_mw.deploy`` to an exported policy. A push is a jump of the
-base's velocity.
+``rollout`` applies it in the training environment, ``legged_mw.deploy`` to an exported policy. A push is a jump of
+the base's velocity.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.peers import COMMON, PEERS, Peer, best_of, robot_of
+from legged_mw import ROOT
 from legged_mw.utils.commands import LABELS, VELOCITY
-from legged_mw.utils.config import ConfigError
+from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 
-SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command, and settling time at its start that is not measured
+EXAM_SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command, and settling time at its start that is not measured
 # [s] time of the first push; [s] time at which the robot must still stand; number of directions
 PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16
 GRAVITY = 9.81  # [m/s^2]
@@ -41,6 +41,50 @@ OFFSET_MARKS = (0.06, 0.06, 0.12)
 AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # name and unit of vx, vy, yaw rate
 
 Velocity = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s]: body frame, at the IMU
+Ranges = tuple[tuple[float, float], ...]  # lowest and highest vx, vy [m/s], yaw rate [rad/s]
+
+
+class Peer(NamedTuple):
+    """A published policy: its figures, and the rules of its measurement."""
+
+    name: str
+    asked: dict[str, Any]  # values of the ExamRules fields that affect its figures
+    figures: dict[str, Any]  # the known keys of an exam's result
+    own_speed: bool = False  # pushes and cost of transport at half its own top speed, whatever the ranges
+
+    def fits(self, rules: ExamRules) -> bool:
+        """Whether it was measured by the same commands and pushes as ``rules``."""
+        apart = ("push_vx", "transport_vx") if self.own_speed else ()
+        return all(getattr(rules, name) == value for name, value in self.asked.items() if name not in apart)
+
+
+def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges]]:
+    """By robot, from ``resources/peers.yaml``: its published policies, and their common command range.
+
+    A policy that was measured in its trained ranges and in the common range is listed twice.
+    """
+    peers: dict[str, list[Peer]] = {}
+    common: dict[str, Ranges] = {}
+    for robot, said in load_yaml(ROOT / "resources/peers.yaml").items():
+        speeds = tuple(said["push_speeds"])
+        peers[robot] = []
+        if "common" in said:
+            common[robot] = tuple((low, high) for low, high in said["common"])
+        for each in said["policies"]:
+            half = round(each["trained"][0] / 2, 4)
+            asked = {"push_speeds": speeds, **{name: each.get(name, half) for name in ("push_vx", "transport_vx")}}
+            pushes = {f"{speed:g}": share for speed, share in zip(speeds, each["pushes"], strict=True)}
+            rest = {"drift": each["drift"], "pushes": pushes, "cost_of_transport": each["cost_of_transport"]}
+            own = {"ranges": tuple((-highest, highest) for highest in each["trained"]), **asked}
+            peers[robot].append(Peer(each["name"], own, {"falls": 0, **each["own"], **rest}))
+            if "common" in each:
+                alike = {"ranges": common[robot], **asked}
+                peers[robot].append(Peer(each["name"], alike, {"falls": 0, **each["common"], **rest}, own_speed=True))
+    return peers, common
+
+
+PEERS, COMMON = _read_peers()
+ALIASES = {"playground_go1": "go1"}  # older runs and exports name a policy
 
 
 class Figure(NamedTuple):
@@ -345,6 +389,27 @@ def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> N
         raise ConfigError(f"exam.push_mark is {mark:g}; it must be one of exam.push_speeds, {speeds}")
     if len(given.get("marks") or "xyw") != 3:
         raise ConfigError(f"exam.marks is {list(given['marks'])}; it must be three numbers, or an empty list")
+
+
+def robot_of(name: str) -> str:
+    """The key in ``PEERS`` for the value of ``exam.peer``; empty for an empty value. Raises ConfigError if unknown."""
+    name = ALIASES.get(name, name)
+    if name and name not in PEERS:
+        raise ConfigError(f"exam.peer: {unknown('robot', name, PEERS, 'resources/peers.yaml')}")
+    return name
+
+
+def best_of(peers: list[Peer]) -> dict[str, Any]:
+    """The best value of each figure over all ``peers``. One policy rarely has all of them."""
+
+    def best(values: list[Any]) -> Any:
+        if isinstance(values[0], list):
+            return [min(column) for column in zip(*values, strict=True)]
+        if isinstance(values[0], dict):
+            return {key: max(value[key] for value in values) for key in values[0]}  # shares of pushes
+        return min(values)
+
+    return {name: best([peer.figures[name] for peer in peers]) for name in (peers[0].figures if peers else ())}
 
 
 def in_common(peer: str) -> dict[str, Any]:

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam
+from legged_mw.eval import rollout
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.rules import LEVELS
+from legged_mw.eval.walking import LEVELS
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
@@ -30,7 +30,7 @@ TILES, REPEATS = 2, 5
 
 OVERRIDES: dict[str, Any] = {
     # keep the task's limit on the base's height: a trunk inside a step is a fall
-    **{path: value for path, value in exam.OVERRIDES.items() if path != "termination.min_base_height"},
+    **{path: value for path, value in rollout.OVERRIDES.items() if path != "termination.min_base_height"},
     "terrain.mesh_type": "heightfield",
     "terrain.curriculum": False,
     "terrain.num_rows": LEVELS,
@@ -71,7 +71,7 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
     assert env.tiles
     kinds = env.tiles.kinds
     repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds are sorted by kind, column, level
-    with torch.random.fork_rng([env.device] if env.device.startswith("cuda") else []):
+    with rollout.keep_random_state(env.device):
         torch.manual_seed(0)
         env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
         outcomes = _walk(env, policy, env.tiles.size / 2)
