@@ -81,9 +81,9 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
     begun = None
     if args.play:
-        from legged_mw.tools.alongside import watch
+        from legged_mw.view.playing import watch_training
 
-        begun = partial(watch, task)
+        begun = partial(watch_training, task)
     if not training.train(task, env, start, examine, export, args.deadline, args.verbose, begun):
         raise SystemExit(training.STOPPED)
 

@@ -23,13 +23,14 @@ from legged_mw.rl import training
 from legged_mw.rl.checkpoint import load_tensors, save_whole
 from legged_mw.rl.runner import Runner
 from legged_mw.sim.device import DeviceFacts, device_facts
-from legged_mw.tools import alongside, compare, completion, doctor, sweep, warm
-from legged_mw.tools.curves import read_run
+from legged_mw.tools import compare, completion, doctor, sweep, warm
+from legged_mw.tools.compare import read_run
 from legged_mw.utils import machine
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
-from legged_mw.view.follow import PLAYING, Newest
+from legged_mw.view import playing
+from legged_mw.view.playing import PLAYING, Newest
 
 
 def program(name: str, *args: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -501,7 +502,7 @@ def test_a_viewer_outlives_a_thinned_checkpoint(tmp_path: Path) -> None:
 
 def test_a_training_goes_on_without_a_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runner: Any = SimpleNamespace(save=lambda path: Path(path).write_bytes(b""))
-    alongside.watch(load_task("go1_flat"), runner, tmp_path / "gone")
+    playing.watch_training(load_task("go1_flat"), runner, tmp_path / "gone")
     assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No such file or directory)\n"
 
 
@@ -524,11 +525,11 @@ def test_training_with_play_starts_a_viewer_and_feeds_it(tmp_path: Path, monkeyp
         started.append(command)
         return SimpleNamespace(poll=lambda: None, terminate=lambda: ended.append(True))
 
-    monkeypatch.setattr(alongside.subprocess, "Popen", popen)
-    monkeypatch.setattr(alongside, "_SECONDS", 0.0)
-    monkeypatch.setattr(alongside, "has_display", lambda: False)
+    monkeypatch.setattr(playing.subprocess, "Popen", popen)
+    monkeypatch.setattr(playing, "_SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(playing, "has_display", lambda: False)
     kept: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(alongside.atexit, "register", lambda *args: kept.append(args))
+    monkeypatch.setattr(playing.atexit, "register", lambda *args: kept.append(args))
     result = run("train", tmp_path, *SMALL, "--max_iterations", "2", "--play")
     assert result.code == 0, result.err
     [folder] = (tmp_path / "logs/go1_flat").iterdir()

@@ -10,9 +10,8 @@ import numpy as np
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval.skill import Floats
-from legged_mw.view.recorder import RobotRenderer
+from legged_mw.view.recorder import RobotRenderer, contact_sheet, save_png
 from legged_mw.view.stage import Moment
-from legged_mw.view.video import contact_sheet, save_png
 
 PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, pictures per row, [px] of each
 

@@ -23,8 +23,7 @@ from statistics import mean, stdev
 from typing import NamedTuple
 
 from legged_mw.rl import flags
-from legged_mw.tools.compare import MOST, figures, rows, text_table, write
-from legged_mw.tools.curves import Run, find_runs
+from legged_mw.tools.compare import MOST, Run, figures, find_runs, rows, text_table, write
 from legged_mw.utils.cli import Parser, apply_overrides
 from legged_mw.utils.errors import shown
 from legged_mw.utils.task import load_task
