@@ -1,4 +1,4 @@
-"""The numbers of a robot's health page, computed by MuJoCo on a CPU: standing, the stability of its servos, initial gains.
+"""A robot's health page as numbers, computed by MuJoCo on a CPU: standing, stability of its servos, initial gains.
 
 Shapes: D joints, V degrees of freedom (the first 6 are the root's), P points. Independent of configs and tasks.
 
@@ -319,11 +319,11 @@ class Gains(NamedTuple):
 def suggest(joints: Sequence[Joint], dt: float, firmness: float = 1.0) -> list[Gains]:
     """Gains for each joint: ``firmness`` times the rules. Left and right joints of a pair get equal gains.
 
-    kp [N m/rad]: full effort at a position error of 1 rad. This is within a factor of two of published gains: ANYmal 80 at
-    80 N m (legged_gym), G1's hip and knee 100 and 150 at 88 and 139 N m (unitree_rl_gym), Go2 20 and 40 at 23.5 and 45 N m
-    (unitree_rl_mjlab), Go1 35 at 23.7 N m (MuJoCo Playground). A lower bound is the kp that holds twice the torque at rest
-    with an error of 0.4 rad, because in a walk half of the feet carry the robot. Without a known effort, kp is this bound,
-    and at least the kp that swings the limb at 2 Hz.
+    kp [N m/rad]: full effort at a position error of 1 rad. This is within a factor of two of published gains: ANYmal 80
+    at 80 N m (legged_gym), G1's hip and knee 100 and 150 at 88 and 139 N m (unitree_rl_gym), Go2 20 and 40 at 23.5 and
+    45 N m (unitree_rl_mjlab), Go1 35 at 23.7 N m (MuJoCo Playground). A lower bound is the kp that holds twice the
+    torque at rest with an error of 0.4 rad, because in a walk half of the feet carry the robot. Without a known effort,
+    kp is this bound, and at least the kp that swings the limb at 2 Hz.
     kd [N m s/rad]: 25 ms of kp. Published: ANYmal 2 for kp 80, Go2 0.5 for 20, G1 2 for 100, Booster T1 5 for 200.
     A robot with more than two feet that does not stand on these gains gets up to twice as much (draft.py).
     Both are cut for stability: dt sqrt(kp / I) <= 0.5 and dt kd / I <= 0.5, with the joint's smallest inertia I.

@@ -310,7 +310,7 @@ def _array(tensor: Tensor) -> FloatArray:
 
 # ---- a policy that is still being trained: train --play writes it, play --follow reads it again
 
-PLAYING = "playing.pt"  # train --play writes this actor into its run for the viewer, more often than checkpoints
+PLAYING = "playing.pt"  # the actor that train --play writes into its run for the viewer, more often than checkpoints
 _CHECK_SECONDS = 2.0  # between two checks of the folder
 _SAVE_SECONDS = 15.0  # between two saves of the policy for the viewer
 
@@ -359,24 +359,10 @@ def watch_training(task: LoadedTask, runner: Runner, folder: Path) -> None:
         except (OSError, MemoryError) as error:
             print(f"WARNING: no viewer opens: cannot write model_0.pt ({reason_of(error)})", flush=True)
             return
-    flags = [
-        "--task",
-        task.name if task.ships else str(task.path),
-        "--load_run",
-        str(folder),
-        "--follow",
-        "--device",
-        "cpu",
-    ]
-    command = [
-        sys.executable,
-        "-m",
-        "legged_mw.programs",
-        "play",
-        *flags,
-        "--viewer",
-        "native" if has_display() else "web",
-    ]
+    name = task.name if task.ships else str(task.path)
+    window = "native" if has_display() else "web"
+    flags = ["--task", name, "--load_run", str(folder), "--follow", "--device", "cpu", "--viewer", window]
+    command = [sys.executable, "-m", "legged_mw.programs", "play", *flags]
     if hasattr(os, "nice"):
         command = ["nice", "-n", "10", *command]
     # in a separate session, so that Ctrl-C reaches only the training, which then ends the viewer

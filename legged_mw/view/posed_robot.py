@@ -1,4 +1,4 @@
-"""Robots posed by `qpos`, their contact patches and the ground below them: kinematics only. Opens no window, no file, no OpenGL context."""
+"""Robots posed by `qpos`, their contact patches and the ground: kinematics only. Opens no window, no OpenGL context."""
 
 from __future__ import annotations
 
