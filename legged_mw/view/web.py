@@ -4,8 +4,6 @@ The page is not encrypted, so by default it is bound to 127.0.0.1; use `ssh -L` 
 `Gate` controls the access. Undocumented parts of Studio are used only in `_bound_to` and `close`, and checked there.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (parts of mujoco.studio that its own types do not name)
 from __future__ import annotations
 
 import atexit
@@ -113,7 +111,7 @@ class WebViewer:
         if not self._listens():
             self.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
-        bound = self._plugin.viewer._http_sock.getsockname()
+        bound = self._plugin.viewer._http_sock.getsockname()  # pyright: ignore[reportAttributeAccessIssue]
         if host == LOCAL and bound[0] != LOCAL:
             self.close()
             raise ViewError(
@@ -124,7 +122,7 @@ class WebViewer:
         """Whether the server listens. Its thread starts after the viewer."""
         return (
             self._plugin.begun.is_set()
-            and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
+            and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1  # pyright: ignore[reportAttributeAccessIssue]
         )
 
 
@@ -148,7 +146,7 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
     try:
         yield
     finally:
-        del web_viewer.print
+        del web_viewer.print  # pyright: ignore[reportAttributeAccessIssue]
         web_server.bind_public_socket, web_server.bind_loopback_socket, web_server.serve = bind, inner, serve
 
 
