@@ -23,9 +23,8 @@ from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import shown
 from legged_mw.utils.task import LoadedTask, load_task
-from legged_mw.view.recorder import no_context, shrunk
+from legged_mw.view.recorder import Frame, no_context, save_png, shrunk
 from legged_mw.view.stage import ViewError
-from legged_mw.view.video import Frame, save_png
 
 PROGRAM = "benchmarks/terrain_picture.py"
 WIDTH, FINER = 1280, 2  # [px] of the picture; it is drawn that much larger and made smaller, which smooths it

@@ -33,7 +33,7 @@ from legged_mw.deploy.stage import idle_command
 from legged_mw.utils.cli import Parser, duration, one_line_errors
 from legged_mw.utils.commands import with_units
 from legged_mw.utils.errors import UserError, printable
-from legged_mw.view.script import parse_command
+from legged_mw.view.drive import parse_command
 
 VERSION = 1
 HELLO, MEASURED, TARGETS, CLOSE, REFUSED = range(1, 6)  # kinds of packet

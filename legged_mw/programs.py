@@ -81,9 +81,9 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
     begun = None
     if args.play:
-        from legged_mw.tools.alongside import watch
+        from legged_mw.view.playing import watch_training
 
-        begun = partial(watch, task)
+        begun = partial(watch_training, task)
     if not training.train(task, env, start, examine, export, args.deadline, args.verbose, begun):
         raise SystemExit(training.STOPPED)
 
@@ -193,7 +193,7 @@ HELP = """legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help
   robot       a robot's health page, and a first task for it
   motion      read and look at reference motions
   doctor      what this machine has, lacks and how fast it trains
-  compare     curves and exams of runs in one page
+  compare     figures, exams and settings of runs side by side
   sweep       train over seeds and values, with a table at the end
   warm        compile kernels ahead of the first training
   completion  the Tab key for bash and zsh"""

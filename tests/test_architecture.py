@@ -75,7 +75,7 @@ ONLY_IN = {
     "legged_mw.robot.mjcf": ["legged_mw/robot/*", "legged_mw/deploy/*", "legged_mw/export/*"],
     "legged_mw.drawing": [
         "legged_mw/drawing/*",
-        "legged_mw/view/env_stage.py",
+        "legged_mw/view/playing.py",
         "legged_mw/export/scene.py",
         "legged_mw/eval/perform.py",
         "legged_mw/robot/picture.py",
@@ -116,7 +116,7 @@ NEVER_IN = {
     ],
 }
 # The environment as a stage, and what play.py prepares of it; the rest of view/ runs where there is no torch.
-MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
+MAY_ALL_THE_SAME = ["legged_mw/view/playing.py"]
 # The one door of the core to a package around it: "this file is not plain".
 HOOKS = {"legged_mw/sim/model.py": ["legged_mw.robot.vendor"]}
 CONFIGS_MAY = [
@@ -310,12 +310,12 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.view.stage import Stage", True),
         ("legged_mw/rl/training.py", "from legged_mw.robot.measure import measure", True),
         ("legged_mw/check/describe.py", "from legged_mw.robot.measure import measure", True),
-        ("legged_mw/robot/picture.py", "from legged_mw.view.video import save_png", False),
+        ("legged_mw/robot/picture.py", "from legged_mw.view.recorder import save_png", False),
         ("legged_mw/sim/ground.py", "from legged_mw.drawing.terrain_look import relief", True),
         ("legged_mw/view/recorder.py", "from legged_mw.drawing.scene import visual_spec", True),
         ("legged_mw/envs/robot_task.py", "from legged_mw.deploy import contract", True),
         ("legged_mw/utils/cli.py", "import legged_mw.eval.report", True),
-        ("legged_mw/view/env_stage.py", "from legged_mw.envs.legged_robot import LeggedRobot", False),
+        ("legged_mw/view/playing.py", "from legged_mw.envs.legged_robot import LeggedRobot", False),
         ("legged_mw/utils/task.py", "if TYPE_CHECKING:\n    pass\nelse:\n    import legged_mw.envs", True),
         ("legged_mw/sim/graph.py", "if TYPE_CHECKING:\n    import legged_mw.envs", True),
         ("legged_mw/rl/ppo.py", "from legged_mw.rl.students.recurrent import HiddenState", True),
@@ -333,8 +333,8 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/robot/draft.py", "from configs.base import BipedCfg", True),
         ("configs/go1_rough.py", "import torch", True),
         ("legged_mw/view/session.py", "import torch", True),
-        ("legged_mw/view/env_stage.py", "import torch", False),
-        ("legged_mw/view/env_stage.py", "from mujoco.studio import plugin", True),
+        ("legged_mw/view/playing.py", "import torch", False),
+        ("legged_mw/view/playing.py", "from mujoco.studio import plugin", True),
         ("legged_mw/view/panel.py", "from mujoco.studio import plugin", True),
         ("legged_mw/deploy/runner.py", "import torch", True),
         ("legged_mw/deploy/runner.py", "from legged_mw.eval import exams", True),

@@ -13,7 +13,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.utils.commands import Command, command_table, with_units
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
-from legged_mw.view.script import outside, parse_command
+from legged_mw.view.drive import outside, parse_command
 
 Go1FlatCfg: Any = type(load_task("go1_flat").cfg)
 

@@ -23,11 +23,21 @@ from legged_mw.utils.commands import Command
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 from legged_mw.view import launch, web
-from legged_mw.view.drive import ACTIONS, BINDINGS, CAMERAS, KEY_ACTION, NO_COMMANDS, SPEEDS, STEPS, Pilot
-from legged_mw.view.env_stage import EnvStage
+from legged_mw.view.drive import (
+    ACTIONS,
+    AFTER,
+    BINDINGS,
+    CAMERAS,
+    KEY_ACTION,
+    NO_COMMANDS,
+    SPEEDS,
+    STEPS,
+    Pilot,
+    load_script,
+)
 from legged_mw.view.native import window_texts
 from legged_mw.view.panel import BUTTONS, CURVE_SECONDS, KEY_NAMES, Curves, Panel
-from legged_mw.view.script import AFTER, load_script
+from legged_mw.view.playing import EnvStage
 from legged_mw.view.session import Session, signed
 from legged_mw.view.stage import Moment, Stage, ViewError, target_velocity
 from tests.worlds import QUIET, make_env
@@ -863,11 +873,11 @@ def test_a_task_without_commands_and_feet_is_a_stage_too() -> None:
 
 
 def test_watching_needs_no_torch() -> None:
-    """What a robot's computer has is enough: all of view/ but env_stage.py and playing.py."""
+    """What a robot's computer has is enough: all of view/ but playing.py."""
     modules = [
         path.stem
         for path in (legged_mw.ROOT / "legged_mw/view").glob("*.py")
-        if path.stem not in ("env_stage", "playing", "__init__", "studio")
+        if path.stem not in ("playing", "__init__", "studio")
     ]
     code = "import sys\nfor name in ('torch', 'warp', 'rsl_rl', 'mujoco_warp'): sys.modules[name] = None\nimport "
     code += ", ".join(f"legged_mw.view.{name}" for name in modules)

@@ -33,7 +33,7 @@ from legged_mw.rl.students.recurrent import forget, memory_of
 from legged_mw.rl.training import advice_on_rate
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
-from legged_mw.view.env_stage import EnvStage
+from legged_mw.view.playing import EnvStage
 
 RECURRENT = {"class_name": "RNNModel", "rnn_hidden_dim": 8, "hidden_dims": [16, 16]}
 

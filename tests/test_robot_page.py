@@ -19,11 +19,10 @@ from legged_mw.envs.statistics import BrokenWorlds, DivergenceStop
 from legged_mw.robot import __main__ as program
 from legged_mw.robot import picture
 from legged_mw.robot.draft import Draft, as_env, draft, table
-from legged_mw.robot.measure import Joint, RobotNumbers, inside_by, measure, tilt
+from legged_mw.robot.measure import Joint, RobotNumbers, family, inside_by, measure, suggest, tilt
 from legged_mw.robot.new import config_text, write
 from legged_mw.robot.page import page
 from legged_mw.robot.picture import HEIGHT, WIDTH, Label, _columns
-from legged_mw.robot.suggest import family, suggest
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.errors import ModelError, UserError

@@ -23,13 +23,14 @@ from legged_mw.rl import training
 from legged_mw.rl.checkpoint import load_tensors, save_whole
 from legged_mw.rl.runner import Runner
 from legged_mw.sim.device import DeviceFacts, device_facts
-from legged_mw.tools import alongside, compare, completion, doctor, sweep, warm
-from legged_mw.tools.curves import read_run
+from legged_mw.tools import completion, doctor, sweep, warm
+from legged_mw.tools.compare import read_run
 from legged_mw.utils import machine
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
-from legged_mw.view.follow import PLAYING, Newest
+from legged_mw.view import playing
+from legged_mw.view.playing import PLAYING, Newest
 
 
 def program(name: str, *args: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,7 +241,7 @@ def write_run(folder: Path, seed: int = 1, gamma: float = 0.99, reward: float = 
     return folder
 
 
-def test_compare_writes_one_page_that_needs_nothing_else(
+def test_compare_prints_figures_exams_and_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -253,29 +254,17 @@ def test_compare_writes_one_page_that_needs_nothing_else(
     (two / "eval/report.json").write_text(json.dumps({"columns": [{"exam": exam}]}))
     os.utime(next(two.glob("events*")), (2e9, 2e9))  # the last run of the task
     program("compare", str(one), "go1_flat", monkeypatch=monkeypatch)
-    head, first, second, written = [line.split() for line in capsys.readouterr().out.splitlines()]
+    figures, graded, settings, curves = [
+        [line.split() for line in part.splitlines()] for part in capsys.readouterr().out.split("\n\n")
+    ]
+    head, first, second = figures
     assert head == ["run", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
     assert (
         first == ["one", "10", "10.0", "0.3", "5,000", "10.00", "1.000"] and second[0] == "two" and second[5] == "30.00"
     )
-    assert written == ["written", "to", "compare.html"]
-    page = (tmp_path / "compare.html").read_text()
-    assert (
-        "<tr><th>algorithm.gamma</th><td>0.99</td><td>0.97</td></tr>" in page
-        and "<th>error yaw rate</th><td>-</td><td>0.03</td>" in page
-    )
-    assert page.count('style="stroke:var(--run1)"') == 2 and page.count("<circle") == 2  # reward, speed; one exam each
-    assert "http" not in page and "<script" not in page and "mean reward" in page and "total steps" not in page
-
-
-def test_axes_have_round_numbers() -> None:
-    assert compare.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and compare.ticks(-0.3, 0.4, 4) == pytest.approx(
-        [-0.4, -0.2, 0, 0.2, 0.4]
-    )
-    assert compare.ticks(5.0, 5.0, 4)[0] < 5.0 < compare.ticks(5.0, 5.0, 4)[-1]
-    assert compare.chart("x", "y", [("red", [1.0], [float("nan")])]) == ""
-    assert [compare.short(value) for value in (0.25, 5000.0, 20000.0, 1.5e6)] == ["0.25", "5000", "20k", "1.5M"]
-    assert len(compare.thin([(float(i), 1.0) for i in range(1000)])) <= compare.POINTS
+    assert graded[1] == settings[1] == ["one", "two"] and ["error", "yaw", "rate", "-", "0.03"] in graded
+    assert settings[2:] == [["algorithm.gamma", "0.99", "0.97"]]
+    assert curves == [["curves:", "tensorboard", "--logdir", "logs/go1_flat"]]
 
 
 def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) -> None:
@@ -501,7 +490,7 @@ def test_a_viewer_outlives_a_thinned_checkpoint(tmp_path: Path) -> None:
 
 def test_a_training_goes_on_without_a_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runner: Any = SimpleNamespace(save=lambda path: Path(path).write_bytes(b""))
-    alongside.watch(load_task("go1_flat"), runner, tmp_path / "gone")
+    playing.watch_training(load_task("go1_flat"), runner, tmp_path / "gone")
     assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No such file or directory)\n"
 
 
@@ -524,11 +513,11 @@ def test_training_with_play_starts_a_viewer_and_feeds_it(tmp_path: Path, monkeyp
         started.append(command)
         return SimpleNamespace(poll=lambda: None, terminate=lambda: ended.append(True))
 
-    monkeypatch.setattr(alongside.subprocess, "Popen", popen)
-    monkeypatch.setattr(alongside, "_SECONDS", 0.0)
-    monkeypatch.setattr(alongside, "has_display", lambda: False)
+    monkeypatch.setattr(playing.subprocess, "Popen", popen)
+    monkeypatch.setattr(playing, "_SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(playing, "has_display", lambda: False)
     kept: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(alongside.atexit, "register", lambda *args: kept.append(args))
+    monkeypatch.setattr(playing.atexit, "register", lambda *args: kept.append(args))
     result = run("train", tmp_path, *SMALL, "--max_iterations", "2", "--play")
     assert result.code == 0, result.err
     [folder] = (tmp_path / "logs/go1_flat").iterdir()

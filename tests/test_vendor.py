@@ -31,7 +31,7 @@ from legged_mw.sim.model import RobotModel, read_file
 from legged_mw.sim.robot_file import read_plain
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
-from legged_mw.view.video import save_png
+from legged_mw.view.recorder import save_png
 
 EXACT = {"sim.iterations": 100, "sim.ls_iterations": 50}
 STILL = {

@@ -29,10 +29,9 @@ from legged_mw.view.drive import BINDINGS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
 from legged_mw.view.overlay import ARC_SEGMENTS, draw, draw_velocities
 from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
-from legged_mw.view.recorder import Recorder, RobotRenderer, shrunk
+from legged_mw.view.recorder import Recorder, RobotRenderer, VideoWriter, contact_sheet, save_png, shrunk
 from legged_mw.view.session import Pace
 from legged_mw.view.stage import Fall, Moment, top_speed
-from legged_mw.view.video import VideoWriter, contact_sheet, save_png
 
 LEG = """<body pos="{0} {1} 0"><joint axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" group="2"/>
 <geom name="foot{1}" size=".03" pos="0 0 -.3" group="2"/></body>"""

@@ -20,7 +20,7 @@ from legged_mw import ROOT
 from legged_mw.deploy.contract import SCENE_FILE, TERRAIN_FILE
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.skills.drop_states import fallen
-from legged_mw.view.video import Frame
+from legged_mw.view.recorder import Frame
 
 IMAGES = ROOT / "docs/images"
 # ground; steps; every other one

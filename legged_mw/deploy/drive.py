@@ -29,8 +29,8 @@ from legged_mw.utils.commands import with_units
 from legged_mw.utils.errors import shown
 from legged_mw.utils.files import writable
 from legged_mw.view import launch
+from legged_mw.view.drive import load_script
 from legged_mw.view.launch import FlagError
-from legged_mw.view.script import load_script
 
 CHECK_KEYS = "keys: s start, x damping, Esc emergency stop"
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"

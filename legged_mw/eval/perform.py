@@ -203,9 +203,8 @@ PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, pictures per row
 def strip(env: RobotTask, qpos: Floats) -> bytes:
     """A PNG of the robot at PICTURES times, evenly spaced over ``qpos`` (T, nq). Raises ViewError if drawing fails."""
     from legged_mw.drawing.scene import visual_spec
-    from legged_mw.view.recorder import RobotRenderer  # imports OpenGL
+    from legged_mw.view.recorder import RobotRenderer, contact_sheet, save_png  # imports OpenGL
     from legged_mw.view.stage import Moment
-    from legged_mw.view.video import contact_sheet, save_png
 
     renderer, none = RobotRenderer(visual_spec(env.robot, env.cfg.viewer.camera), WIDTH, HEIGHT), np.zeros((1, 3))
     frames = []

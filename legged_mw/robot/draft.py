@@ -13,7 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -21,13 +23,19 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
-from legged_mw.robot.crouch import bent, pose_weights
-from legged_mw.robot.feet import Foot, guess_feet
-from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, stand_on_servos, what_joints_bear
-from legged_mw.robot.suggest import Gains, suggest
+from legged_mw.robot.measure import (
+    Gains,
+    Joint,
+    mass_matrices,
+    stand_as_statue,
+    stand_on_servos,
+    suggest,
+    what_joints_bear,
+)
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
+from legged_mw.sim.surface_points import surfaces
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import import_task
@@ -212,3 +220,155 @@ def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[f
         return per_joint(short, names, "") == list(numbers)
     except ModelError:
         return False
+
+
+# ---- the feet: the lowest bodies without children, and bodies of the same family on other legs
+
+# [m], and share of the robot's height: ends of limbs up to this much higher than the lowest one are feet too
+_SAME, _SAME_SHARE = 0.03, 0.08
+_SOLE = 0.015  # [m] geoms up to this much higher than the lowest geom of a foot belong to its sole
+
+
+class Foot(NamedTuple):
+    """A foot with a name for the task's config."""
+
+    name: str  # of its only geom, of a body with exactly these geoms, or of a body with more geoms
+    geoms: tuple[str, ...]
+    known: bool  # whether the name selects exactly these geoms
+
+
+def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
+    """The feet in the order of the file, for the robot at ``qpos`` (7 + D,).
+
+    Raises ModelError if no end of a limb collides.
+    """
+    model, parents = robot.physics, {*robot.physics.body_parentid[1:]}
+    colliding = [g for g in range(robot.ground_geoms().stop, model.ngeom) if model.geom_conaffinity[g]]
+    names = [model.geom(g).name for g in colliding if model.geom_bodyid[g] not in parents]
+    of_body: dict[int, dict[int, float]] = {}
+    for name, points in surfaces(model, posed(model, qpos[7:], qpos[:7]), names).items():
+        geom = model.geom(name)
+        of_body.setdefault(int(geom.bodyid[0]), {})[geom.id] = float(points[:, 2].min())
+    if not of_body:
+        raise ModelError(
+            "no part that ends a limb collides, so that no feet can be guessed; give the feet colliding geoms"
+        )
+    lowest = min(min(these.values()) for these in of_body.values())
+    near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
+    soles = {body: _sole(model, these) for body, these in of_body.items() if min(these.values()) <= near}
+    for body, these in of_body.items():  # a lifted leg has the same kind of foot
+        same = [
+            other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))
+        ]
+        if body not in soles and same and len(of_body[same[0]]) == len(these):
+            soles[body] = [geom for geom, like in zip(these, of_body[same[0]], strict=True) if like in soles[same[0]]]
+    return [_foot(robot, body, soles[body]) for body in sorted(soles)]
+
+
+def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
+    """The sole of a body: its lowest geom, and geoms of that type at about that height.
+
+    ``low``: geom -> z of its lowest point [m, world frame].
+    """
+    lowest = min(low, key=lambda geom: low[geom])
+    return [g for g, z in low.items() if z <= low[lowest] + _SOLE and model.geom_type[g] == model.geom_type[lowest]]
+
+
+def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
+    """The foot with these geoms of ``body``, named by its geom or body."""
+    names = tuple(robot.physics.geom(geom).name for geom in geoms)
+    # also bodies that are fused in the simulated model
+    parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]
+    if parts:
+        return Foot(parts[-1], names, True)
+    return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
+
+
+# ---- the pose of a file without one: bent knees, each foot under its hip, level soles
+
+# Ours: knee angle [rad] about the axis to the left, by number of feet. A quadruped leans its thighs back (Go1 0.9 and
+# -1.8), a biped forwards.
+KNEE = {2: 0.6}
+KNEE_ELSE = -1.6
+WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # from configs/g1_flat.py
+_SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
+_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
+_MARGIN = 0.05  # [rad] distance to the limits of a joint
+
+
+def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
+    """``pose`` (D,) with all legs bent; None if a leg has fewer than two sideways joints.
+
+    A straight leg cannot push, and its servos have no preferred direction to bend. The first two joints of a leg about
+    the sideways axis are assumed to be hip and knee, and the leg to be straight with both at 0. A third one, the ankle,
+    keeps the sole level.
+    """
+    model, found = robot.physics, pose.copy()
+    data = posed(model, pose)
+    for foot in feet:
+        legs = [joint for joint in _joints_to(model, foot) if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        if len(legs) < 2:
+            return None
+        hip, knee, *ankle = legs
+        turn = KNEE.get(len(feet)) or KNEE_ELSE * _forward(data, model, knee, foot)
+        signs = np.sign(data.xaxis[legs, 1])
+        angles = [_within(model, knee, sign * turn * signs[1]) for sign in (1.0, -1.0)]
+        found[knee - 1] = max(angles, key=abs) if abs(angles[0]) < 0.5 * abs(turn) else angles[0]
+        found[hip - 1] = _over(model, found, hip, foot)
+        for joint, sign in zip(ankle[:1], signs[2:], strict=False):
+            leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
+            found[joint - 1] = _within(model, joint, -sign * leaning)
+    return found
+
+
+def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
+    """Weights (D,) of a biped's pose reward: smallest for hip and knee, small for the ankle, large for all others."""
+    model, data = robot.physics, posed(robot.physics, pose)
+    weights = [HELD] * len(robot.joint_names)
+    for foot in feet:
+        legs = _joints_to(model, foot)
+        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        for joint in sideways[:2]:
+            weights[joint - 1] = WALKS
+        for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
+            weights[joint - 1] = ANKLE
+    return weights
+
+
+def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:
+    """The direction of the knee: 1.0 if the foot of the straight leg is below or ahead of the knee, -1.0 if behind."""
+    ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
+    return -1.0 if ahead < -_BEHIND else 1.0
+
+
+def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
+    """The joints from the root to the foot, without the root joint."""
+    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
+    while body:
+        first = int(model.body_jntadr[body])
+        joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
+        body = int(model.body_parentid[body])
+    return sorted(joints)
+
+
+def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
+    """The nearest angle within the joint's limits."""
+    if not model.jnt_limited[joint]:
+        return float(angle)
+    low, high = model.jnt_range[joint]
+    margin = min(_MARGIN, 0.25 * (high - low))
+    return float(np.clip(angle, low + margin, high - margin))
+
+
+def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot) -> float:
+    """The hip angle [rad] at which the foot is under the hip: the best of 200 angles within 90 deg."""
+    geoms = [model.geom(name).id for name in foot.geoms]
+    off = {}
+    for angle in np.linspace(-1.57, 1.57, 200):
+        trial = pose.copy()
+        trial[hip - 1] = allowed = _within(model, hip, angle)
+        data = posed(model, trial)
+        middle = data.geom_xpos[geoms].mean(axis=0)
+        away = middle - data.xanchor[hip]
+        off[allowed] = abs(float(away[0])) + (10.0 if away[2] > 0.0 else 0.0)
+    return round(min(off, key=lambda angle: off[angle]), 2)

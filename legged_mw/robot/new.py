@@ -36,7 +36,7 @@ _COMMENTS = {
     "joint_speed_limits": "[rad/s] the file's",
     "colliders": "the feet alone touch the ground",
     "pos": "[m] standing, computed",
-    "stiffness": "[N m/rad] LOOK: computed (legged_mw/robot/suggest.py)",
+    "stiffness": "[N m/rad] LOOK: computed (legged_mw/robot/measure.py)",
     "damping": "[N m s/rad] LOOK: likewise",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "lin_vel_x": "[m/s] LOOK: what you want of it",

@@ -11,8 +11,7 @@ import torch
 from legged_mw.check.guard import nothing_changed, tiny_cfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.ranks import this_rank
-from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Joint, RobotNumbers, Stand, measure
-from legged_mw.robot.suggest import Gains, suggest
+from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Gains, Joint, RobotNumbers, Stand, measure, suggest
 from legged_mw.utils.errors import in_short, place_of
 from legged_mw.utils.task import LoadedTask
 

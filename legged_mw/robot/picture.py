@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.joints import family
 from legged_mw.sim.model import RobotModel
-from legged_mw.view.feet import patch
 from legged_mw.view.overlay import connect, draw_disc
-from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots, boxes
-from legged_mw.view.recorder import no_context
+from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots, boxes, patch
+from legged_mw.view.recorder import Frame, no_context, save_png
 from legged_mw.view.stage import FloatArray, ViewError
-from legged_mw.view.video import Frame, save_png
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
 VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]

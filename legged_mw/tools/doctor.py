@@ -176,12 +176,12 @@ def pictures() -> Iterator[Finding]:
         else "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
     )
     yield Finding("MUJOCO_GL", chosen or "not set", mend)
-    from legged_mw.view import video, web
+    from legged_mw.view import recorder, web
 
     yield Finding("window", "yes" if has_display() else "no screen: play shows a web page instead")
     reason = web.missing()
     yield Finding("web page", reason or "yes", "pip install --force-reinstall mujoco mujoco-studio" if reason else "")
-    reason = video.no_encoder()
+    reason = recorder.no_encoder()
     yield Finding("video", reason or "yes", "pip install av" if reason else "")
 
 

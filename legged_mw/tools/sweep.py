@@ -16,17 +16,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from datetime import datetime
 from functools import partial
 from itertools import product
 from statistics import mean, stdev
 from typing import NamedTuple
 
 from legged_mw.rl import flags
-from legged_mw.tools.compare import MOST, figures, rows, text_table, write
-from legged_mw.tools.curves import Run, find_runs
+from legged_mw.tools.compare import Run, curves_of, figures, find_runs, rows, text_table
 from legged_mw.utils.cli import Parser, apply_overrides
-from legged_mw.utils.errors import shown
 from legged_mw.utils.task import load_task
 
 STOPPED = 3  # exit code of a training run that a signal ended, from rl/training.py
@@ -93,11 +90,7 @@ def main() -> None:
     stop.listen()
     found = train_all(cells, ["--task", args.task, *rest], partial(start, stop=stop), stop)
     if found:
-        print(f"\n{table(found)}")
-        if 1 < len(found) <= MOST:
-            page = found[0][1].folder.parent / f"sweep_{datetime.now():%Y-%m-%d_%H-%M-%S}.html"
-            write([run for _, run in found], page)
-            print(f"\ncurves: {shown(page)}")
+        print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}")
     if len(found) < len(cells):
         raise SystemExit(1)
 

@@ -1,4 +1,4 @@
 """Watch and drive robots: a stage simulates, a viewer shows it, a pilot holds the user's input.
 
-Needs numpy, mujoco and yaml. Only env_stage.py imports torch.
+Needs numpy, mujoco and yaml. Only playing.py imports torch.
 """

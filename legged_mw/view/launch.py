@@ -14,13 +14,11 @@ from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.machine import has_display
 from legged_mw.view import web
-from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
+from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot, load_script, outside, parse_command
 from legged_mw.view.native import NativeViewer
-from legged_mw.view.recorder import Recorder
-from legged_mw.view.script import load_script, outside, parse_command
+from legged_mw.view.recorder import Recorder, check_format, no_encoder
 from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
-from legged_mw.view.video import check_format, no_encoder
 
 VIEWERS = ("auto", "native", "web", "video", "none")
 ROBOTS_SHOWN = 64  # at most: drawing more takes longer than a control step

@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from legged_mw.view.feet import Patch
-from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
+from legged_mw.view.posed_robot import Patch, Placement, PosedRobots, show_groups
 from legged_mw.view.stage import FloatArray, Moment
 
 # ours: vermillion, sky blue, bluish green and reddish purple of Okabe and Ito's palette, safe for the colour-blind

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from legged_mw.utils.commands import LABELS, Command, with_units
-from legged_mw.view.drive import Pilot
-from legged_mw.view.script import Script
+from legged_mw.view.drive import Pilot, Script
 from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity, top_speed
 
 FALL_SECONDS = 2.0  # ours: [s] display time of the place of a fall

@@ -1,7 +1,7 @@
 """The two protocols of watching: a stage moves robots, a viewer shows a moment of them. Types only.
 
 A stage is the training environment or another physics; a viewer is a window, a web page or a file. Neither knows the
-other: `session.py` steps the stage and passes moments to the viewer. In `view/` only `env_stage.py` imports torch.
+other: `session.py` steps the stage and passes moments to the viewer. In `view/` only `playing.py` imports torch.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from legged_mw.export import replay as export_replay
 from legged_mw.sim.mujoco_engine import MujocoSimulation
 from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.task import load_task
-from legged_mw.view.env_stage import EnvStage
+from legged_mw.view.playing import EnvStage
 
 NOTE = "is not to be trusted: simulator overflow (NEFC) in 3 of 4 worlds; raise njmax (now 1)"
 

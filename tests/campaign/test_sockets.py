@@ -28,9 +28,8 @@ from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.serve import SimulatedUnitree
 from legged_mw.view.drive import Pilot
-from legged_mw.view.gate import MOST, Gate, is_local
 from legged_mw.view.stage import Moment, ViewError
-from legged_mw.view.web import WebViewer
+from legged_mw.view.web import MOST, Gate, WebViewer, is_local
 from tests.wires import POLICIES
 
 NAN, INF = math.nan, math.inf

@@ -10,7 +10,7 @@ from legged_mw.unitree import handset
 from legged_mw.unitree.faults import parse_faults
 from legged_mw.utils.commands import command_table
 from legged_mw.utils.task import load_task
-from legged_mw.view.script import load_script
+from legged_mw.view.drive import load_script
 
 FLAGS = """
 nosuch

@@ -10,7 +10,6 @@ import pytest
 from golden.table import Table
 from legged_mw import ROOT, programs
 from legged_mw.robot import new
-from legged_mw.tools import compare
 
 GO1, WAVE = ROOT / "resources/robots/go1/go1.xml", ROOT / "resources/motions/g1_wave.npz"
 ROBOT = [
@@ -36,7 +35,7 @@ MOTION = [
     f"{WAVE} --rate 0.01",
 ]
 MOTION += [f"{WAVE} --task go1_flat", f"{WAVE} --lift nan", f"{WAVE} --task nosuch", "words.csv", "narrow.csv"]
-COMPARE = ["", "nosuch", " ".join("abcdefghijklmn"), "nosuch --over days", "a/../b"]
+COMPARE = ["", "nosuch", "nosuch --over days", "nosuch --out a.html", "a/../b"]
 SWEEP = ["", "--task go1_flat --resume", "--task go1_flat --seeds 1,x", "--task go1_flat --run_name a"]
 
 
@@ -70,7 +69,6 @@ def table() -> Table:
         made.programs(name, lines)
     made.programs("doctor", ["--x"])
     made.calls({"no program": legged_mw, "no such program": lambda: legged_mw("trian")})
-    made.add("compare to a folder", lambda root: compare.write([], root / "folder"))
     made.add(
         "robot to a folder that is a file", lambda root: new.write(None, GO1, "a", root / "there.xml", True, False)
     )  # type: ignore[arg-type]

@@ -203,10 +203,9 @@ BEYOND = {  # raises that no case can come to, or none that is cheap: file -> wh
     "tools/completion.py": "a mistake of a program's, not of a user's",
     "utils/yaml_file.py": "is caught there, and said with file and line: area yaml_files",
     "view/drive.py": "a mistake of a program's, not of a user's",
-    "view/gate.py": "is caught",
     "view/overlay.py": "a mistake of a program's, not of a user's",
     "view/posed_robot.py": "a mistake of a program's, not of a user's",
-    "view/video.py": "a mistake of a program's, not of a user's",
+    "view/recorder.py": "a mistake of a program's, not of a user's",
     "view/web.py": "needs a page that is served: tests/test_drive.py",
 }
 

@@ -28,7 +28,7 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.rl.transfer import check_start
 from legged_mw.utils.commands import Command
 from legged_mw.utils.task import LoadedTask, Task, load_task
-from legged_mw.view.script import parse_command
+from legged_mw.view.drive import parse_command
 
 FIELDS: dict[str, dict[str, Any]] = {
     "no row of a group left": {

@@ -16,8 +16,7 @@ from legged_mw.utils.commands import Command
 from legged_mw.view import launch, native, web
 from legged_mw.view.drive import Pilot
 from legged_mw.view.native import NativeViewer
-from legged_mw.view.recorder import RobotRenderer
-from legged_mw.view.video import VideoWriter
+from legged_mw.view.recorder import RobotRenderer, VideoWriter
 from legged_mw.view.web import WebViewer, free_port
 
 SPEC = """<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
