@@ -112,10 +112,8 @@ def _firm(
         gains = suggest(joints, float(model.opt.timestep), firmness)
         model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
         model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
-        if (
-            stand_on_servos(replace(robot, physics=model), np.array(pose), place, RobotTaskCfg.control.decimation).end
-            == "stands"
-        ):
+        firm = replace(robot, physics=model)
+        if stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
             return firmness, gains
     return 1.0, suggest(joints, float(model.opt.timestep))
 

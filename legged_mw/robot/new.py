@@ -150,13 +150,8 @@ def _force_limits(found: Draft) -> list[str]:
     endless = [joint.name for joint in found.joints if joint.effort == float("inf")]
     if not endless:
         return []
-    some = (
-        "all joints"
-        if len(endless) == len(found.joints)
-        else f"{endless[0]} and {len(endless) - 1} more"
-        if endless[1:]
-        else endless[0]
-    )
+    some = f"{endless[0]} and {len(endless) - 1} more" if endless[1:] else endless[0]
+    some = "all joints" if len(endless) == len(found.joints) else some
     return [f'        # effort = {{"": 30.0}}  # [N m] LOOK: the file has no force limit for {some}; write yours']
 
 

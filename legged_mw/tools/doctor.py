@@ -86,24 +86,15 @@ def machine() -> Iterator[Finding]:
     """Python, cores, memory, disk, location of the package."""
     version = platform.python_version()
     fits = (3, 11) <= sys.version_info[:2] <= (3, 13)
-    yield Finding(
-        "Python",
-        f"{version}, {sys.executable}",
-        "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13",
-        needed=not fits,
-    )
+    mend = "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13"
+    yield Finding("Python", f"{version}, {sys.executable}", mend, needed=not fits)
     yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}")
-    memory = (
-        f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
-        if hasattr(os, "sysconf")
-        else ""
-    )
+    memory = ""
+    if hasattr(os, "sysconf"):
+        memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    busy = (
-        "others use this machine: what is measured now is slower than it could be"
-        if load > usable_cores() + 0.5
-        else ""
-    )
+    others = "others use this machine: what is measured now is slower than it could be"
+    busy = others if load > usable_cores() + 0.5 else ""
     yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}; load {load:.1f}", busy)
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     mend = "" if free > 1.0 else "a run writes up to a few hundred MB: free some disk, or start elsewhere"
@@ -124,12 +115,8 @@ def training() -> Iterator[Finding]:
             version = _version(needs.name)
             fits = bool(version) and needs.specifier.contains(version, prereleases=True)
             wanted = "" if fits or not version else f", which is not {needs.specifier}"
-            yield Finding(
-                needs.name,
-                f"{version or 'missing'}{wanted}",
-                "" if fits else f"pip install '{needs}'",
-                needed=not version,
-            )
+            mend = "" if fits else f"pip install '{needs}'"
+            yield Finding(needs.name, f"{version or 'missing'}{wanted}", mend, needed=not version)
 
 
 def gpus() -> Iterator[Finding]:
@@ -171,11 +158,9 @@ def pictures() -> Iterator[Finding]:
         works += [name] * (not fault)
         yield Finding(name, fault or "draws")
     mend = (
-        ""
-        if works
-        else "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
+        "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
     )
-    yield Finding("MUJOCO_GL", chosen or "not set", mend)
+    yield Finding("MUJOCO_GL", chosen or "not set", "" if works else mend)
     from legged_mw.view import recorder, web
 
     yield Finding("window", "yes" if has_display() else "no screen: play shows a web page instead")

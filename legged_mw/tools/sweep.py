@@ -204,13 +204,8 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
         columns = figures(runs).values()
         for group, of in groups.items():
             if len(of) > 1:
-                means.append(
-                    [
-                        *group,
-                        f"mean of {len(of)}",
-                        *(_mean(digits, [values[i] for i in of]) for digits, values in columns),
-                    ]
-                )
+                figured = [_mean(digits, [values[i] for i in of]) for digits, values in columns]
+                means.append([*group, f"mean of {len(of)}", *figured])
     return text_table([[*short, *heads], *cells, *means])
 
 

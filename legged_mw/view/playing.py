@@ -214,10 +214,8 @@ class EnvStage:
         self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
         self._gait = env.gait if isinstance(env, LeggedRobot) else None
         self._command_columns, self._clock_columns = _columns_of(env, "commands"), _columns_of(env, "gait_clock")
-        geoms = (
-            len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
-        )
-        self._foot_contacts = env.contact_count[:, :geoms]
+        feet = env.foot_geoms.values() if isinstance(env, LeggedRobot) else ()
+        self._foot_contacts = env.contact_count[:, : len({geom for geoms in feet for geom in geoms})]
         self._obs = env.get_observations()
         self._believed: Tensor | None = None  # estimated vx, vy (N, 2) at the last action
         self._overflowed = False  # and the user has been warned

@@ -153,11 +153,8 @@ def many_robots(
             for shape in body.geoms:
                 shape.group, shape.rgba = GROUPS_SHOWN - 1, PLAIN
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    spec.stat.extent, spec.stat.center, spec.stat.meansize = (
-        single.stat.extent,
-        single.stat.center,
-        single.stat.meansize,
-    )
+    spec.stat.extent, spec.stat.meansize = single.stat.extent, single.stat.meansize
+    spec.stat.center = single.stat.center
     spec.copy_during_attach = True
     bases = [spec.joints[0].parent]
     for index in range(1, count):

@@ -49,14 +49,9 @@ class RobotRenderer:
         self._option = mujoco.MjvOption()
         show_groups(self._option)
         try:
-            scale = mujoco.mjtFontScale
-            font = (
-                scale.mjFONTSCALE_50
-                if width <= TINY
-                else scale.mjFONTSCALE_100
-                if width <= SMALL
-                else scale.mjFONTSCALE_150
-            )
+            font = mujoco.mjtFontScale.mjFONTSCALE_150
+            if width <= SMALL:
+                font = mujoco.mjtFontScale.mjFONTSCALE_50 if width <= TINY else mujoco.mjtFontScale.mjFONTSCALE_100
             self._renderer = mujoco.Renderer(
                 self.robots.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font
             )
@@ -136,10 +131,8 @@ class Recorder:
     def show(self, moment: Moment) -> None:
         """Record a frame if its time has come."""
         film = self._writer is not None and self._turn % self._every == 0
-        still = (
-            len(self._pictures) < len(self._sheet_times)
-            and moment.time >= self._sheet_times[len(self._pictures)] - 1e-9
-        )
+        waiting = self._sheet_times[len(self._pictures) :]
+        still = bool(waiting) and moment.time >= waiting[0] - 1e-9
         self._turn += 1
         if not (film or still):
             return
@@ -261,11 +254,8 @@ class VideoWriter:
         self._stream: Any = self._container.add_stream(
             CODECS[kind], rate=rate, options={} if gif else {"crf": str(CRF)}
         )
-        self._stream.width, self._stream.height, self._stream.pix_fmt = (
-            self.width,
-            self.height,
-            "pal8" if gif else "yuv420p",
-        )
+        self._stream.width, self._stream.height = self.width, self.height
+        self._stream.pix_fmt = "pal8" if gif else "yuv420p"
         self._palette: Any = self._palette_graph() if gif else None
 
     def _palette_graph(self) -> Any:
@@ -330,10 +320,5 @@ def save_png(path: Path | str, frame: Frame) -> None:
     rows = np.hstack([np.zeros((height, 1), dtype=np.uint8), np.ascontiguousarray(frame).reshape(height, width * 3)])
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    data = (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(rows.tobytes()))
-        + chunk(b"IEND", b"")
-    )
-    Path(path).write_bytes(data)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
+    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)

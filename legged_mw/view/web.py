@@ -254,15 +254,11 @@ class Gate:
 
     def url(self, host: str) -> str:
         """The address for the user's browser. For all interfaces (0.0.0.0, ::) it names this machine."""
-        name = (
-            "localhost"
-            if host == LOCAL
-            else socket.gethostname()
-            if host in ("0.0.0.0", "::")
-            else f"[{host}]"
-            if ":" in host
-            else host
-        )
+        name = f"[{host}]" if ":" in host else host
+        if host == LOCAL:
+            name = "localhost"
+        elif host in ("0.0.0.0", "::"):
+            name = socket.gethostname()
         return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
     def refusal(self, target: str, header: Callable[[str], list[str]]) -> str:
