@@ -8,8 +8,6 @@ import sys
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatch
 
-import pytest
-
 from configs.go1_handstand import Go1HandstandCfg
 from configs.robots.go2 import Go2
 from legged_mw import ROOT
@@ -21,6 +19,7 @@ FILES = sorted(
     for pattern in ("legged_mw/**/*.py", "configs/**/*.py", "examples/*.py", "*.py")
     for p in ROOT.glob(pattern)
 )
+SOURCES = {path: (ROOT / path).read_text() for path in FILES}
 MAX_FUNCTION = 60  # lines of one that reads as one story; a file is as long as its concept
 
 MAX_ROBOT, MAX_TASK = 60, 20  # lines of a file in configs/robots/ and in configs/
@@ -271,14 +270,12 @@ def words_of_others(source: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", FILES)
-def test_imports_run_one_way(path: str) -> None:
-    assert violations(path, (ROOT / path).read_text()) == []
+def test_imports_run_one_way() -> None:
+    assert [f"{path}: {name}" for path, source in SOURCES.items() for name in violations(path, source)] == []
 
 
-@pytest.mark.parametrize(
-    ("path", "source", "caught"),
-    [
+def test_the_import_rules_themselves() -> None:
+    for path, source, caught in [
         ("legged_mw/envs/legged_robot.py", "import warp as wp", True),
         ("legged_mw/envs/legged_robot.py", "def f():\n    from mujoco_warp import step", True),
         ("legged_mw/envs/legged_robot.py", "import mujoco", True),
@@ -353,46 +350,28 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/rl/training.py", "from legged_mw.check.guard import check_recordable", True),
         ("legged_mw/programs.py", "from legged_mw.check.guard import check_recordable", False),
         ("legged_mw/programs.py", "from legged_mw.export.exporter import export", False),
-    ],
-)
-def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> None:
-    assert bool(violations(path, source)) == caught
+    ]:
+        assert bool(violations(path, source)) == caught, f"{path}: {source}"
 
 
-@pytest.mark.parametrize(
-    ("package", "files"),
-    [
+def test_few_files_of_the_core_name_what_they_do_not_import() -> None:
+    """As a string, to be imported where it is asked for."""
+    core = [path for path in FILES if layer(path.removesuffix(".py").replace("/", ".")) >= 0]
+    for package, files in [
         ("legged_mw.fast", ["legged_mw/utils/opaque.py"]),
         # the config's default, the table of classes that a config may name, and where an old run's class is now
         (
             "legged_mw.rl.students",
             ["legged_mw/rl/learner_config.py", "legged_mw/rl/rsl_rl_settings.py", "legged_mw/utils/renamed.py"],
         ),
-    ],
-)
-def test_few_files_of_the_core_name_what_they_do_not_import(package: str, files: list[str]) -> None:
-    """As a string, to be imported where it is asked for."""
-    core = [path for path in FILES if layer(path.removesuffix(".py").replace("/", ".")) >= 0]
-    others = [path for path in core if not path.startswith(f"{package.replace('.', '/')}/")]
-    assert [path for path in others if package in (ROOT / path).read_text()] == files
+    ]:
+        others = [path for path in core if not path.startswith(f"{package.replace('.', '/')}/")]
+        assert [path for path in others if package in SOURCES[path]] == files
 
 
 def test_no_two_modules_import_each_other() -> None:
-    files = {path.removesuffix(".py").replace("/", ".").removesuffix(".__init__"): path for path in FILES}
-    assert circles({name: (ROOT / path).read_text() for name, path in files.items()}) == []
-
-
-@pytest.mark.parametrize(
-    "back",
-    [
-        "import a.one",
-        "from a import one",
-        "from a.one import x",
-        "def f():\n    from a.one import x",
-        "if TYPE_CHECKING:\n    import a.one",
-    ],
-)
-def test_circles_are_found(back: str) -> None:
+    modules = {path.removesuffix(".py").replace("/", ".").removesuffix(".__init__"): path for path in FILES}
+    assert circles({name: SOURCES[path] for name, path in modules.items()}) == []
     straight = {
         "a": "",
         "a.one": "import a.two\nimport numpy",
@@ -401,8 +380,15 @@ def test_circles_are_found(back: str) -> None:
         "b": "import a.one",
     }
     assert circles(straight) == []
-    assert circles({**straight, "a.three": back}) == [("a.one", "a.three", "a.two")]
-    assert circles({**straight, "a.two": back}) == [("a.one", "a.two")]
+    for back in (
+        "import a.one",
+        "from a import one",
+        "from a.one import x",
+        "def f():\n    from a.one import x",
+        "if TYPE_CHECKING:\n    import a.one",
+    ):
+        assert circles({**straight, "a.three": back}) == [("a.one", "a.three", "a.two")]
+        assert circles({**straight, "a.two": back}) == [("a.one", "a.two")]
 
 
 def package_of(name: str) -> str:
@@ -425,31 +411,30 @@ def package_graph(sources: Mapping[str, str]) -> dict[str, set[str]]:
 
 def test_no_two_packages_import_each_other() -> None:
     """Neither directly nor round about."""
-    sources = {path: (ROOT / path).read_text() for path in FILES if path.startswith("legged_mw/")}
+    sources = {path: source for path, source in SOURCES.items() if path.startswith("legged_mw/")}
     assert rounds(package_graph(sources)) == []
     back = {**sources, "legged_mw/deploy/exam.py": "from legged_mw.unitree.client import UnitreeRobot"}
     assert rounds(package_graph(back)) == [("deploy", "unitree")]
 
 
-@pytest.mark.parametrize("path", FILES)
-def test_functions_stay_readable(path: str) -> None:
-    source = (ROOT / path).read_text()
-    assert too_long(source) == []
-    assert ast.get_docstring(ast.parse(source)), "a module docstring says what lives here"
+def test_functions_stay_readable() -> None:
+    assert {path: long for path, source in SOURCES.items() if (long := too_long(source))} == {}
+    silent = [path for path, source in SOURCES.items() if not ast.get_docstring(ast.parse(source))]
+    assert silent == [], "a module docstring says what lives here"
+    body = "".join(f"    x = {i}\n" for i in range(MAX_FUNCTION - 1))
+    assert too_long(f"def f():\n{body}") == []
+    assert too_long(f"class A:\n    pass\nasync def g():\n{body}    y = 1\n") == [f"g: {MAX_FUNCTION + 1} lines"]
 
 
-@pytest.mark.parametrize("path", [path for path in FILES if path.startswith("configs/robots/")])
-def test_a_robot_is_a_short_config(path: str) -> None:
-    assert len((ROOT / path).read_text().splitlines()) <= MAX_ROBOT
+def test_a_robot_and_a_task_are_short_configs() -> None:
+    """A task is of one robot."""
+    lines = {path: len(source.splitlines()) for path, source in SOURCES.items()}
+    robots = [path for path in FILES if path.startswith("configs/robots/")]
+    assert robots and [path for path in robots if lines[path] > MAX_ROBOT] == []
+    tasks = [task for task in task_names() if task not in SPELL_OUT]
+    assert tasks and [task for task in tasks if lines[f"configs/{task}.py"] > MAX_TASK] == []
+    assert [task for task in task_names() if len(robots_of(type(load_task(task).cfg))) != 1] == []
 
-
-@pytest.mark.parametrize("task", task_names())
-def test_a_task_is_one_robot_in_few_lines(task: str) -> None:
-    assert task in SPELL_OUT or len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= MAX_TASK
-    assert len(robots_of(type(load_task(task).cfg))) == 1
-
-
-def test_a_task_of_two_robots_is_found() -> None:
     class Heir(Go2, Go1HandstandCfg):
         pass
 
@@ -460,20 +445,10 @@ def test_a_task_of_two_robots_is_found() -> None:
     assert robots_of(Own) == {"configs.robots.go2"}
 
 
-def test_what_is_too_long_is_found() -> None:
-    body = "".join(f"    x = {i}\n" for i in range(MAX_FUNCTION - 1))
-    assert too_long(f"def f():\n{body}") == []
-    assert too_long(f"class A:\n    pass\nasync def g():\n{body}    y = 1\n") == [f"g: {MAX_FUNCTION + 1} lines"]
-
-
-@pytest.mark.parametrize("path", [path for path in FILES if path.startswith("legged_mw/sim/")])
-def test_sim_knows_numbers_alone(path: str) -> None:
-    assert words_of_others((ROOT / path).read_text()) == []
-
-
-@pytest.mark.parametrize(
-    ("source", "found"),
-    [
+def test_sim_knows_numbers_alone() -> None:
+    sim = [path for path in FILES if path.startswith("legged_mw/sim/")]
+    assert {path: words for path in sim if (words := words_of_others(SOURCES[path]))} == {}
+    for source, found in [
         ('raise ModelError("leave it out of asset.colliders")', ["asset.c"]),
         ('f"{x}; say --device cpu"', ["--d"]),
         ('"terrain.tile_size must"', ["terrain.t"]),
@@ -484,10 +459,8 @@ def test_sim_knows_numbers_alone(path: str) -> None:
         ("x.max_reward = 1", ["reward"]),
         ('"see legged_mw.sim.simulation and docs/terrain.md"', []),
         ("terrain.heights", []),
-    ],
-)
-def test_words_that_sim_may_not_say_are_found(source: str, found: list[str]) -> None:
-    assert words_of_others(source) == found
+    ]:
+        assert words_of_others(source) == found
 
 
 def test_all_files_were_looked_at() -> None:

@@ -27,7 +27,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export import exporter as exporting
 from legged_mw.export.exporter import ExportError, export
 from legged_mw.rl.saved_config import update_from_run
-from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
+from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.task import load_task
 
 BIPED, DT = "examples/toy_biped.py", 0.02
@@ -345,77 +345,6 @@ def test_joints_may_begin_anywhere_near_the_default_pose() -> None:
     assert ankles.min() == -0.9 and ankles.max() == 0.9  # the ends of their range
     still = biped()
     assert torch.equal(still.dof_pos, still.default_dof_pos.expand(2, -1)) and not still.dof_vel.any()
-
-
-# ---- errors
-
-CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
-
-
-@pytest.mark.parametrize(
-    ("task", "settings", "text"),
-    [
-        (
-            BIPED,
-            {"gait.period": 0.0, "rewards.scales.contact_phase": 0.0},
-            rf"^rewards.scales.feet_phase is on, but {CLOCK}",
-        ),
-        (
-            BIPED,
-            {"gait.period": 0.0, "rewards.scales.feet_phase": 0.0},
-            rf"^rewards.scales.contact_phase is on, but {CLOCK}",
-        ),
-        (
-            BIPED,
-            {"rewards.base_height_target": 0.0},
-            r"^rewards.scales.base_height is on, but rewards.base_height_target is 0; write the wanted height of the root",
-        ),
-        (
-            BIPED,
-            {"rewards.hip_joints": []},
-            "^rewards.scales.hip_pos is on, but rewards.hip_joints is empty; write names of joints, parts of them or patterns$",
-        ),
-        (BIPED, {"rewards.hip_joints": ["hipp"]}, r"^rewards.hip_joints: no joint 'hipp' in the robot; .*left_hip"),
-        (
-            BIPED,
-            {"gait.offsets": [0.0]},
-            r"^gait.offsets has 1 numbers; write one share of the period a foot \(left, right\)$",
-        ),
-        (BIPED, {"gait.offsets": [0.0, 1.5]}, r"gait.offsets\[1\] is 1.5; it must be from 0 to 1$"),
-        (BIPED, {"gait.stance": 1.0}, r"gait.stance is 1.0; it must be above 0 and below 1$"),
-        (
-            "go1_flat",
-            {"gait.period": 0.5},
-            r"^gait.offsets is empty; write one share of the period a foot \(FR, FL, RR, RL\), e.g. \[0.0, 0.5, 0.5, 0.0\]: a trot, "
-            "where they are front right, front left, rear right, rear left$",
-        ),
-        (
-            "go1_flat",
-            {"rewards.scales.no_fly": 1.0},
-            "^rewards.scales.no_fly is on, but it is for robots with two feet; asset.foot_names has 4$",
-        ),
-        (
-            "go1_flat",
-            {"rewards.scales.single_stance": 1.0},
-            "^rewards.scales.single_stance is on, but it is for robots with two feet; asset.foot_names has 4$",
-        ),
-        (
-            BIPED,
-            {"init_state.dof_pos_offset": [0.1]},
-            r"init_state.dof_pos_offset is \[0.1\]; it must be two numbers, the lower first$",
-        ),
-        (BIPED, {"init_state.dof_vel_range": -1.0}, r"init_state.dof_vel_range is -1.0; it must be from 0 to 1000$"),
-    ],
-)
-def test_what_is_asked_without_what_it_needs(task: str, settings: dict[str, Any], text: str) -> None:
-    with pytest.raises(ConfigError, match=text):
-        make_env(1, {**QUIET, **(ON if task == BIPED else {}), **settings}, task=task)
-
-
-def test_one_foot_has_no_neighbour() -> None:
-    one = {"asset.foot_names": ["left"], "asset.foot_geoms": {"left": ["left_heel"]}}
-    with pytest.raises(ConfigError, match="asset.foot_names has one foot, which has no neighbour$"):
-        make_env(1, {**QUIET, "rewards.scales.feet_distance": 1.0, **one}, task=BIPED)
 
 
 # ---- deployed

@@ -21,7 +21,7 @@ from legged_mw.rl.iteration_log import FiniteCheck
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
-from legged_mw.utils.errors import ModelError, StepError, in_short
+from legged_mw.utils.errors import StepError, in_short
 from legged_mw.utils.renamed import LEGGED_GYM_TENSORS
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
@@ -34,49 +34,12 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "wanted"),
-    [
-        ("env.num_envs", 0, "1 or more"),
-        ("sim.dt", -0.004, "from 0.0001 to 0.1 s"),
-        ("control.decimation", 0, "from 1 to 1000"),
-        ("env.episode_length_s", math.inf, "above 0 and at most 1,000,000 s"),
-        ("terrain.friction", -1.0, "0 or more"),
-        ("terrain.seed", -1, "0 or more"),
-        ("terrain.horizontal_scale", 0.3, "above 0 and at most 0.25 m, or a cell would be wider than a step of stairs"),
-        ("commands.ranges.lin_vel_x", [1.0, -1.0], "two numbers, the lower first"),
-        ("commands.ranges.lin_vel_y", [0.5], "two numbers, the lower first"),
-        ("commands.keep_probability", [0.9, 0.25], "three numbers, and more for further commands; each from 0 to 1"),
-        ("perturbation.duration", [0.2, 0.1], "two numbers, the lower first; each above 0"),
-        (
-            "domain_rand.link_mass",
-            [0.9],
-            "two numbers, the lower first, or an empty list; each above 0 and at most 1000",
-        ),
-        ("rewards.mirror_joints", [["FR_", "RL_"], ["FL_"]], "pairs: lists of two names or patterns each"),
-        ("termination.max_tilt", 0.0, "above 0 and at most 180 degrees"),
-        ("init_state.pos", [0.0, 0.3], "three numbers, or an empty list; each from -1000 to 1000 m"),
-        ("viewer.camera", [0.0, 0.0, 1.0], "three numbers, not straight above or below, or an empty list"),
-        ("runner.save_interval", 0, "1 or more"),
-        ("actor.hidden_dims", [], "a list of at least one; each 1 or more"),
-        ("algorithm.num_mini_batches", -1, "1 or more"),
-        ("algorithm.gamma", 5.0, "from 0 to 1"),
-        ("env.episode_length_s", 3e38, "above 0 and at most 1,000,000 s"),
-        ("algorithm.clip_param", 3e38, "finite, and 10^12 at most"),
-        ("rewards.tracking_sigma", 3e38, "finite, and 10^12 at most"),
-        ("warm_start.critic_warmup", 10**18, "from 0 to 1,000,000"),
-        ("termination.min_base_height", 30.0, "from 0 to 10 m"),
-        ("rewards.base_height_target", 27.0, "from 0 to 10 m"),
-        ("rewards.swing_height", 27.0, "above 0 and at most 10 m"),
-        ("runner.run_name", "a/b", "a plain name such as wide_net, of 100 bytes at most"),
-    ],
+    ("path", "value"),
+    [("env.num_envs", 0), ("commands.ranges.lin_vel_y", [0.5]), ("runner.save_interval", 0)],
 )
-def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
-    """By a flag, a file, an assignment, and in the class statement, where it has its place too."""
+def test_a_value_out_of_bounds_is_refused_in_the_class_statement(path: str, value: Any) -> None:
+    """Where it has its place; tests/golden/numbers.py has what the other ways say."""
     task = load_task("go1_flat")
-    text = f"{path} is {value!r}; it must be {wanted}"
-    with pytest.raises(ConfigError) as error:
-        task.set(path, value)
-    assert str(error.value) == f"--set: {text}"
     *sections, name = path.split(".")
     owner, body = type(task.cfg if sections[0] in task.cfg.to_dict() else task.train), {name: value}
     parents = [owner]
@@ -90,85 +53,7 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
         }
     with pytest.raises(ConfigError) as error:
         type("Bad", (owner,), body)
-    assert f"{name} is {value!r}; it must be {wanted}" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "text"),
-    [
-        ("asset.foot_names", [], "asset.foot_names is []; it must be a list of at least one name, one for each foot"),
-        (
-            "asset.foot_names",
-            ["FR", "FR"],
-            "asset.foot_names is ['FR', 'FR']; it must be a list of at least one name, one for each foot and each once",
-        ),
-        ("asset.foot_names", ["*_foot"], "asset.foot_names is ['*_foot']; it must be a list of at least one name"),
-        (
-            "control.stiffness",
-            {"": 35.0, "hip": -35.0},
-            "control.stiffness['hip'] is -35.0; it must be from 0 to 1,000,000",
-        ),
-        ("domain_rand.friction", [0.0, 1.0], "domain_rand.friction[0] is 0.0; it must be from 1e-05"),
-        (
-            "domain_rand.model_factors",
-            {"dof_armature": [2.0, 1.0]},
-            "domain_rand.model_factors['dof_armature'] is [2.0, 1.0]; it must be two",
-        ),
-        (
-            "init_state.default_joint_angles",
-            {"thigh": 51.0},
-            "init_state.default_joint_angles['thigh'] is 51.0; it must be from -2 pi to 2 pi",
-        ),
-        (
-            "control.action_scale",
-            1e5,
-            "control.action_scale is 100000.0; it must be another number than 0, and 10,000 at most",
-        ),
-        ("domain_rand.base_com", [100.0, 100.0], "domain_rand.base_com[0] is 100.0; it must be from -10 to 10 m"),
-        (
-            "domain_rand.contact_time",
-            [1e-9, 1e-9],
-            "domain_rand.contact_time[0] is 1e-09; it must be from 0.0001 to 10 s",
-        ),
-        ("env.episode_length_s", 1e-9, "env.episode_length_s is 1e-09, shorter than a control step of 0.02 s"),
-        ("commands.mirror", {"lin_vel_x": 0.5}, "commands.mirror['lin_vel_x'] is 0.5; it must be 1 or -1"),
-        ("terrain.condim", 2, "terrain.condim must be Literal[1, 3, 4, 6], not 2 (int)"),
-        (
-            "terrain.terrain_proportions",
-            {"stairs_up": math.inf},
-            "terrain.terrain_proportions['stairs_up'] is inf; it must be finite",
-        ),
-        ("terrain.measured_points_y", [math.nan], "terrain.measured_points_y[0] is nan; it must be from -100 to 100 m"),
-        ("control.action_scale", {"": 0.0}, "control.action_scale[''] is 0.0; it must be another number than 0"),
-        ("control.action_scale", 0.0, "control.action_scale is 0.0; it must be another number than 0"),
-        ("seed", 10**30, f"seed is {10**30}; it must be a whole number below 2^63"),
-        ("rewards.scales.torques", 1e39, "rewards.scales.torques is 1e+39; it must be finite"),
-        ("cpu.overrides", {"sim.dt": math.nan}, "cpu.overrides['sim.dt'] is nan; it must be finite"),
-    ],
-)
-def test_where_in_a_table_or_list_is_named(path: str, value: Any, text: str) -> None:
-    task = load_task("go1_flat")
-    with pytest.raises(ConfigError) as error:
-        task.set(path, value)
-        task.cfg.check()
-        task.train.check(task.cfg.env.num_envs)
-    assert text in str(error.value)
-
-
-@pytest.mark.parametrize("field", ["nosuch", "opt"])
-@pytest.mark.parametrize("factor", [1.0, 2.0])
-def test_a_factor_on_a_field_that_is_none_is_refused_whatever_it_is(field: str, factor: float) -> None:
-    with pytest.raises(ModelError, match=field):
-        make_env(1, {"domain_rand.enable": True, "domain_rand.model_factors": {field: [factor, factor]}})
-
-
-def test_a_command_of_a_users_own_has_a_range() -> None:
-    task = load_task("go1_flat")
-    vars(task.cfg.commands.ranges)["height"] = [0.3, 0.2]
-    with pytest.raises(
-        ConfigError, match=r"^commands.ranges.height is \[0.3, 0.2\]; it must be two numbers, the lower first$"
-    ):
-        task.cfg.check()
+    assert f"{name} is {value!r}; it must be " in str(error.value)
 
 
 def fields() -> list[tuple[LoadedTask, str, Any]]:
@@ -198,46 +83,6 @@ def test_no_field_takes_a_number_that_is_not_finite(number: float) -> None:
 def test_every_whole_number_says_its_bounds() -> None:
     whole = (int, list[int], dict[str, int])
     assert not [path for _, path, kind in fields() if bare(kind) in whole and not bounds_text(kind)]
-
-
-def test_no_number_is_cut_off_in_silence() -> None:
-    task = load_task("go1_flat")
-    task.set("commands.keep_probability", [0.9, 0.25, 0.5, 0.5])
-    text = "^commands.keep_probability has 4 numbers, but there are 3 commands: lin_vel_x, lin_vel_y, ang_vel_yaw$"
-    with pytest.raises(ConfigError, match=text):
-        task.cfg.check()
-
-
-@pytest.mark.parametrize(
-    "name", ["stiffness", "damping", "action_scale", "pose_weights", "default_joint_angles", "joint_speed_limits"]
-)
-def test_a_table_of_joints_is_checked_when_the_environment_is_made(name: str) -> None:
-    """Not where it is read, which may be at the end of an exam; all joints are named."""
-    section = {"pose_weights": "rewards", "default_joint_angles": "init_state", "joint_speed_limits": "asset"}.get(
-        name, "control"
-    )
-    legs = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
-    with pytest.raises(
-        ModelError, match=rf"^{section}\.{name}: no joint 'wheel' in the MJCF; there are: {', '.join(legs)} "
-    ):
-        make_env(1, {f"{section}.{name}": {"": 1.0, "wheel": 2.0}})
-    if name in ("stiffness", "damping", "action_scale", "pose_weights"):  # the other tables may be silent
-        thighs = ", ".join(joint for joint in legs if "thigh" in joint)
-        with pytest.raises(
-            ModelError,
-            match=rf"^{section}\.{name}: no value for {thighs}: none of \['hip', 'calf'\] is a part of these",
-        ):
-            make_env(1, {f"{section}.{name}": {"hip": 1.0, "calf": 1.0}})
-
-
-def test_fewer_samples_than_minibatches_are_named() -> None:
-    task = load_task("go1_flat")
-    task.set("env.num_envs", 1)
-    task.set("runner.num_steps_per_env", 3)
-    text = r"an iteration has 3 samples \(1 worlds x 3 steps\), fewer than algorithm.num_mini_batches = 4; raise"
-    with pytest.raises(ConfigError, match=text):
-        task.cfg.check()
-        task.train.check(task.cfg.env.num_envs)
 
 
 # ---- methods of a user's class ----

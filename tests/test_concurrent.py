@@ -28,7 +28,6 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, pick_teacher_worlds
 from legged_mw.rl.transfer import attach_teacher_observations, begin_with, load_teacher
-from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
 TAUGHT = {
@@ -206,34 +205,6 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
 # ---- what the config asks for
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"groups": ["privileged"]}, "groups: no observation group 'privileged' .* did you mean 'privileged_state'"),
-        (
-            {"groups": ["state"]},
-            "groups: the actor reads 'state' itself; the teacher's encoder is for what a robot does not measure",
-        ),
-        ({"actor.class_name": "RNNModel"}, "groups: that goes with actor.class_name 'MLPModel', not 'RNNModel'"),
-        (
-            {"algorithm.class_name": "PPO"},
-            "groups: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to",
-        ),
-        (
-            {"actor.estimator.targets": ["base_lin_vel"]},
-            "groups are both set: the actor reads an estimate or a latent; empty one",
-        ),
-    ],
-    ids=lambda value: "" if isinstance(value, str) else "".join(value),
-)
-def test_what_cannot_be(changes: dict[str, Any], said: str) -> None:
-    task = task_with(**{name if "." in name else f"actor.concurrent.{name}": value for name, value in changes.items()})
-    with pytest.raises(ConfigError, match=f"actor.concurrent.{said}"):
-        task.cfg.check()
-        task.train.check(task.cfg.env.num_envs)
-        make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
-
-
 def test_check_says_who_is_taught() -> None:
     task = task_with()
     said = describe(LeggedRobot(task.cfg, "cpu"), task)
@@ -290,16 +261,12 @@ def test_deploy_acts_as_training_would(policy: ConcurrentModel, run_folder: Path
     np.testing.assert_allclose(stage.controller.last_actions, wanted, atol=1e-5)
 
 
-def test_training_begins_with_a_checkpoint_and_not_with_an_export(run_folder: Path) -> None:
+def test_training_begins_with_a_checkpoint(run_folder: Path) -> None:
     task = task_with(domain_rand__enable=True, domain_rand__observe=True)
     model: Any = make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu").alg.get_policy()
     begin_with(model, find_trained(str(run_folder), run_folder.parent, "--init"))
     saved = load(run_folder / "model_3.pt")["actor_state_dict"]
     assert torch.equal(model.teacher[1][0].weight, saved["teacher.1.0.weight"])
-    with pytest.raises(
-        ConfigError, match="policy.onnx holds the student alone, not the teacher's encoder .*; name a checkpoint"
-    ):
-        begin_with(model, find_trained(str(run_folder / "export"), run_folder.parent, "--init"))
 
 
 @pytest.mark.parametrize("frames", [1, 5])

@@ -494,34 +494,14 @@ def test_set(path: str, text: Any, expected: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("env.num_env", "3"),
-        ("rewards.scale.torques", "3"),
-        ("num_envs", "3"),
-        ("env", "3"),
-        ("env.num_envs.x", "3"),
-        ("control.stiffness.hip", "3"),
-        ("env.num_envs", "3.5"),
-        ("env.num_envs", "many"),
-        ("env.is_flat", "1"),
-        ("commands.ranges.lin_vel_x", "[1, a]"),
-        ("commands.ranges.lin_vel_x", "[1, 2"),
-        ("rewards.scales.new", "abc"),
-        ("rewards.scales._open", "0"),
-        ("rewards.scales.a-b", "0"),
-        ("rewards.total", "0"),
-        ("", "0"),
-        ("env.", "0"),
-    ],
+    ("path", "value"), [("env.num_envs", "many"), ("env.num_env", "3"), ("rewards.scales.a-b", "0")]
 )
-def test_set_errors(path: str, value: Any) -> None:
+def test_what_set_refuses_changes_nothing(path: str, value: str) -> None:
+    """tests/golden/config_classes.py has what it says of each mistake."""
     cfg = Base()
-    with pytest.raises(ConfigError, match=f"^--set: {re.escape(path.partition('.')[0])}"):
-        cfg.set(path, value)
-    assert cfg.diff(Base()) == []
     with says("elsewhere: "):
         cfg.set(path, value, where="elsewhere")
+    assert cfg.diff(Base()) == []
 
 
 # ---- update and diff ------------------------------------------------------------------------------------------------
@@ -693,6 +673,7 @@ def test_a_class_of_an_old_run_is_found_where_it_moved_to(old: str) -> None:
     saved = task.to_dict()
     saved["distillation"]["class_name"] = old
     update_from_run(task, saved, where="config.yaml")
+    assert task.train.distillation.class_name == old.replace("rl.dist", "rl.students.dist")
     check_classes(task.train)
     assert resolve_callable(task.train.distillation.class_name) is GraphedDistillation
 
@@ -701,15 +682,6 @@ def test_a_wrong_section_of_an_old_run_is_named() -> None:
     saved = {**load_task("go1_flat").to_dict(), "cpu": {"kick_curriculum": False, "overrides": 3}}
     with says("config.yaml: cpu.overrides"):
         update_from_run(load_task("go1_flat"), saved, where="config.yaml")
-
-
-@pytest.mark.parametrize("separator", [":", "."])
-def test_an_old_run_names_a_class_by_its_old_module(separator: str) -> None:
-    task = load_task("go1_flat")
-    saved = task.to_dict()
-    saved["distillation"]["class_name"] = f"legged_mw.rl.distillation{separator}GraphedDistillation"
-    update_from_run(task, saved, where="config.yaml")
-    assert task.train.distillation.class_name == f"legged_mw.rl.students.distillation{separator}GraphedDistillation"
 
 
 # ---- what a CPU takes instead

@@ -23,9 +23,9 @@ from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
+from legged_mw.deploy.contract import Contract, ContractRow, Ends, read_contract
 from legged_mw.deploy.controller import Controller
-from legged_mw.deploy.exam import contract_rules, run_exam
+from legged_mw.deploy.exam import contract_rules
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
@@ -37,7 +37,6 @@ from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.saved_config import update_from_run
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
-from legged_mw.utils.files import digest
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
@@ -105,116 +104,6 @@ def put(path: str, value: Any) -> Callable[[Any], None]:
         said[last] = value
 
     return change
-
-
-WRONG = [
-    (
-        lambda said: said["observation"].pop(3),
-        "does not fit policy.yaml: its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 36]",
-    ),
-    (put("observation.3.size", 11), "observation row 'dof_pos' has size 11; joint_offset has 12 values on this robot"),
-    (
-        put("observation.3.measured", "joint_ofset"),
-        "no quantity 'joint_ofset' in what a robot measures; did you mean 'joint_offset'?",
-    ),
-    (
-        put("observation.0.measured", ""),
-        "observation row 'base_lin_vel': nothing says how it is measured, so it cannot be deployed; in the task",
-    ),
-    (put("joints.4", "FL_thihg_joint"), "no joint 'FL_thihg_joint' in scene.xml; did you mean 'FL_thigh_joint'?"),
-    (put("joints.4", "FL_hip_joint"), "policy.yaml: 'joints' is ["),
-    (
-        lambda said: [
-            part[name].pop()
-            for part, name in (
-                (said["action"], "lowest"),
-                (said["action"], "highest"),
-                *((said, name) for name in PER_JOINT),
-            )
-        ],
-        "has size 12; joint_offset has 11 values",
-    ),
-    (
-        put("observation.4.scale", [1.0, 2.0]),
-        "observation[4]: 'scale' is [1.0, 2.0]; it must be a number, or 12 numbers, one a value of the row",
-    ),
-    (
-        put("ends.falls_on", ["trunk_box"]),
-        "sensors: 'fall_contact' is missing; name the sensors of scene.xml that measure it",
-    ),
-    (put("default_pose", [0.0] * 11), "it must be 12 numbers, one a joint"),
-    (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
-    (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),
-    (put("robot.mass", 20.0), "robot: mass is 20., but scene.xml has 12.743"),
-    (
-        put("format", 1),
-        "'format' is 1; it must be one of 2, 3, 4, 5, which this version reads; export the policy again",
-    ),
-    (
-        put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 0]}),
-        "policy.yaml: network: memory: 'shape' is [1, 0]; it must be two whole numbers from 1: states and the size of each",
-    ),
-    (
-        put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 8]}),
-        "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 48], 'state_in' [1, 1, 8] (the rows",
-    ),
-    (without("format"), "policy.yaml: 'format' is missing; it must be one of 2, 3, 4, 5, which"),
-    (without("action.lowest"), "policy.yaml: action: 'lowest' is missing; it must be 12 numbers, one a joint"),
-    (put("action.highest.0", -1.0), "policy.yaml: action: 'highest' is [-1.0, "),
-    (put("action.highest.0", 0.5), "policy.yaml: action: highest is [ 0.5 ,"),
-    (without("physics.sha256"), "policy.yaml: physics: 'sha256' is missing"),
-    (
-        without("action.scale"),
-        "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint",
-    ),
-    (put("action.scale", [0.5] * 11), "it must be a number, or 12 numbers, one a joint"),
-    (
-        put("action.origin", "pose"),
-        "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets, torque",
-    ),
-    (
-        without("action.origin"),
-        "policy.yaml: action: 'origin' is missing; it must be one of default, joints, targets, torque",
-    ),
-    (without("commands"), "policy.yaml: 'commands' is missing; it must be a list of mappings"),
-    (
-        put("commands.1.default", 0.9),
-        "policy.yaml: commands[1]: 'default' is 0.9; it must be a number from -0.8 to 0.8",
-    ),
-    (lambda said: said["commands"].pop(), "observation row 'commands' has size 3; command has 2 values on this robot"),
-    (put("observation.3.history", 0), "policy.yaml: observation[3]: 'history' is 0; it must be a whole number from 1"),
-    (put("observation.3.history", 3), "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 72]"),
-    (without("ends"), "policy.yaml: 'ends' is missing; it must be a mapping"),
-    (
-        put("ends.max_tlit", 60.0),
-        "policy.yaml: ends: no rule 'max_tlit' in the rules that end a walk; did you mean 'max_tilt'?",
-    ),
-    (put("ends.max_tilt", 200.0), "policy.yaml: ends: 'max_tilt' is 200.0; it must be a number from 0 to 180"),
-    (put("action.clip", float("nan")), "policy.yaml: action: 'clip' is nan; it must be a number"),
-    (put("period", 0.03), "'period' is 0.03; it must be physics: timestep * decimation = 0.02"),
-    (put("network.input", "observations"), "the contract's is 'observations' [1, 48]"),
-    (
-        put("sensors.ang_vel", ["gyro/imuu"]),
-        "sensors of 'ang_vel': no sensor 'gyro/imuu' in scene.xml; did you mean 'gyro/imu'?",
-    ),
-    (
-        put("sensors.ang_vel", ["gyro/imu", "up/imu"]),
-        "the sensors of 'ang_vel' (gyro/imu, up/imu) have 6 values, not 3",
-    ),
-    (without("sensors.joint_vel"), "sensors: 'joint_vel' is missing; name the sensors of scene.xml that measure it"),
-    (put("exam", 3), "policy.yaml: 'exam' is 3; it must be a mapping"),
-    (put("observation", {}), "policy.yaml: 'observation' is {}; it must be a list of mappings"),
-]
-
-
-@pytest.mark.parametrize(("change", "said"), WRONG, ids=[said[:40] for _, said in WRONG])
-def test_a_wrong_contract(
-    change: Callable[[Any], Any], said: str, export: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rewrite(export, change)
-    code, out, err = main(capsys, export)
-    assert (code, out) == (2, "") and err.startswith("legged_mw.deploy: ") and err.count("\n") == 1
-    assert said in err
 
 
 def edit(folder: Path, change: Callable[[Any], Any]) -> None:
@@ -347,57 +236,13 @@ def test_an_older_format(export: Path, contract: Contract, capsys: pytest.Captur
     assert code == 2 and "leaves the range of the targets to scene.xml" in err and "export the policy again" in err
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "other"])
-def test_a_damaged_network(damage: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The contract knows its network by digest; a network that was broken before it was signed is refused as well."""
-    file = export / "policy.onnx"
-    whole = file.read_bytes()
-    if damage == "other":  # same shapes, another network
-        model = onnx.load_from_string(whole)
-        model.graph.initializer[0].raw_data = bytes(len(model.graph.initializer[0].raw_data))
-        file.write_bytes(model.SerializeToString())
-    else:
-        file.write_bytes({"cut": whole[: len(whole) // 2], "empty": b"", "text": b"not a network\n"}[damage])
+def test_another_network_of_the_same_shapes_is_refused(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The contract knows its network by digest; tests/golden/contract.py has those that are damaged."""
+    model = onnx.load(export / "policy.onnx")
+    model.graph.initializer[0].raw_data = bytes(len(model.graph.initializer[0].raw_data))
+    onnx.save(model, export / "policy.onnx")
     code, _, err = main(capsys, export)
-    assert code == 2 and err.count("\n") == 1
-    assert (
-        "policy.onnx is not the file that policy.yaml was written for (its SHA-256 differs): it is damaged, or of another export"
-        in err
-    )
-    if damage != "other":
-        rewrite(export, put("network.sha256", hashlib.sha256(file.read_bytes()).hexdigest()))
-        code, _, err = main(capsys, export)
-        assert (
-            code == 2
-            and err
-            == "legged_mw.deploy: policy.onnx cannot be read as an ONNX network: it is damaged; export the policy again\n"
-        )
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_missing_file(name: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = main(capsys, "go1_flta")
-    assert (
-        code == 2
-        and "no folder go1_flta, and no policy 'go1_flta' in resources/policies; did you mean 'go1_flat'? there are: "
-        in err
-    )
-    (export / name).unlink()
-    code, _, err = main(capsys, export)
-    assert (
-        code == 2
-        and f"no {name} in {export}; make an export with: python play.py --task <task> --export {export}" in err
-    )
-
-
-def test_broken_texts(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (export / "scene.xml").write_text("<mujoco><worldbody>")
-    rewrite(export, put("physics.sha256", digest(export / "scene.xml")))
-    code, _, err = main(capsys, export)
-    assert code == 2 and "scene.xml is not a valid MJCF: " in err and err.count("\n") == 1
-    (export / "policy.yaml").write_text("!!python/object/apply:os.system ['touch evil']")
-    code, _, err = main(capsys, export)
-    assert code == 2 and "not valid YAML" in err and err.count("\n") == 1 and not Path("evil").exists()
+    assert code == 2 and "SHA-256" in err
 
 
 def test_numbers_as_people_write_them(export: Path) -> None:
@@ -405,34 +250,6 @@ def test_numbers_as_people_write_them(export: Path) -> None:
     assert "scale: 0.5" in text
     (export / "policy.yaml").write_text(text.replace("scale: 0.5", "scale: 5e-1"))
     np.testing.assert_array_equal(read_contract(export).action.scale, [0.5] * 12)
-
-
-@pytest.mark.parametrize(
-    ("args", "said"),
-    [
-        (
-            ("--eval", "--viewer", "none"),
-            "--eval brings its own commands, is on flat ground and shows nothing: leave --viewer out",
-        ),
-        (("--eval", "--command", "1,0,0"), "leave --command out"),
-        (("--eval", "--terrain"), "leave --terrain out"),
-        (("--command", "1,0,0", "--commands", "x.yaml"), "--commands brings its own commands: leave --command out"),
-        (
-            ("--command", "fast"),
-            "--command fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])",
-        ),
-        (("--command", "0,0,nan"), "--command 0,0,nan: 'nan' is no number; write --command=0,0,0"),
-        (
-            ("--command", "0,1,0"),
-            "--command 0,1,0: vy = 1 m/s is outside of what was trained, [-0.8, 0.8] m/s; the ranges are in ",
-        ),
-        (("--command", "base_height=0.3"), "--command base_height=0.3: no command 'base_height' in this task"),
-        (("--time", "soon"), "'soon' is no duration"),
-    ],
-)
-def test_a_wrong_command_line(args: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = main(capsys, SHIPPED, *args)
-    assert code == 2 and said in err and err.count("\n") == 1
 
 
 # ---- the same walk as in the training environment
@@ -578,7 +395,6 @@ def test_it_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     code, out, err = main(capsys, SHIPPED, "--commands", tmp_path / "script.yaml", "--viewer", "none")
     assert code == 0, err
     assert "+0.50 +0.00 +0.00" in out and "+0.00 +0.40 +0.00" in out and "4.0 s, 0 falls" in out
-    assert "the ranges are in" in main(capsys, SHIPPED, "--viewer", "none", "--command", "9,0,0")[2]
 
 
 def test_an_end_that_nobody_judges_is_said(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -624,26 +440,11 @@ def test_results_of_a_shipped_policy_go_to_the_logs(
     assert sorted(path.name for path in SHIPPED.iterdir()) == before
 
 
-def test_the_common_range_of_published_policies(capsys: pytest.CaptureFixture[str]) -> None:
-    """Asked of a robot that has none, and without an exam."""
-    code, _, err = main(capsys, SHIPPED, "--eval", "--ranges", "common")
-    assert (
-        code == 2
-        and "exam: --ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1"
-        in err
-    )
-    code, _, err = main(capsys, SHIPPED, "--ranges", "common")
-    assert code == 2 and "--ranges says what the exam asks: add --eval" in err
-
-
 def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
     shipped = contract_rules(read_contract(export))
     assert shipped.peer == "go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     rewrite(export, put("exam", {"push_speeds": [1.5], "push_mark": 1.5}))
     assert contract_rules(read_contract(export)).push_speeds == (1.5,)
-    rewrite(export, put("exam", {"push_speeds": 3}))
-    with pytest.raises(ContractError, match="policy.yaml: exam: .int. object is not iterable"):
-        contract_rules(read_contract(export))
 
 
 def test_a_result_that_cannot_be_written(
@@ -834,11 +635,6 @@ def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
     np.testing.assert_allclose(stage.velocity()[:, :2], 0.0, atol=0.1)  # it stands
     done = run(MujocoRobot(export, contract), Controller(export, contract), lambda _: np.zeros(0), 0.1, live=False)
     assert done.steps == 5 and done.velocity is not None
-    with pytest.raises(
-        ContractError,
-        match="the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: lin_vel_x, lin",
-    ):
-        run_exam(export)
 
 
 def test_targets_that_are_not_finite_close_the_robot(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:

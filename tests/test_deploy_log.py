@@ -98,25 +98,12 @@ def test_a_log_that_was_cut_off(logged: tuple[Path, Watched], tmp_path: Path) ->
         read_log(cut)
 
 
-def test_what_is_no_log(tmp_path: Path, contract: Contract, logged: tuple[Path, Watched]) -> None:
-    wrong = tmp_path / "wrong.lmwlog"
-    with pytest.raises(LogError, match="cannot read .*wrong.lmwlog: No such file"):
-        read_log(wrong)
-    for content in (
-        b"",
-        b"no log",
-        b"x" * 100,
-        b"\x05" + b"\0" * 7 + b"hello",
-        b"\0" * 8,
-        b"\x05" + b"\0" * 7 + b"PK\x03\x04-",
-    ):
+def test_what_is_no_log(tmp_path: Path, contract: Contract) -> None:
+    wrong, short = tmp_path / "wrong.lmwlog", b"\x05" + b"\0" * 7
+    for content in (b"", b"no log", b"x" * 100, short + b"hello", b"\0" * 8, short + b"PK\x03\x04-"):
         wrong.write_bytes(content)
         with pytest.raises(LogError, match=r"wrong.lmwlog is no log of legged_mw.deploy"):
             read_log(wrong)
-    with pytest.raises(
-        LogError, match=r"cannot write the log .*walk.lmwlog: File exists; say --log FILE, or --log off"
-    ):
-        Log(logged[0], contract, GO2, "")
     assert log_path(contract).parent == Path("logs/deploy") and log_path(contract).name.startswith("go2_flat_")
 
 
@@ -263,17 +250,6 @@ def test_the_log_of_a_motion_needs_nothing_beside_it(tmp_path: Path) -> None:
     run(Watched(folder, contract), Controller(folder, contract), lambda _: np.zeros(0), 2.0, live=False, log=log)
     assert read_log(log.path).files["motion.npz"] == (folder / "motion.npz").read_bytes()
     assert len(replay(log.path).simulated["target"]) == 100
-
-
-def test_replay_of_another_network(logged: tuple[Path, Watched], tmp_path: Path, contract: Contract) -> None:
-    with pytest.raises(
-        LogError,
-        match=r"is of another network than the one in resources/policies/go1_flat \(go2_flat\); name its export",
-    ):
-        replay(logged[0], ROOT / "resources/policies/go1_flat")
-    walk(tmp_path / "short.lmwlog", contract, 2.5)
-    with pytest.raises(LogError, match="short.lmwlog holds no walk of 50 steps: the policy was not on for so long"):
-        replay(tmp_path / "short.lmwlog")
 
 
 def test_the_program_draws_a_log(

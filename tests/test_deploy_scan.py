@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import zipfile
 from contextlib import suppress
@@ -20,10 +19,7 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.seal import sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.export.scene import among_steps
 from legged_mw.robot.mjcf import MOST_BYTES, XmlSource, write_archive
-from legged_mw.sim.model import ModelError
-from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
 
@@ -54,28 +50,6 @@ def test_the_contract_says_where_the_scan_looks() -> None:
     assert contract.scan and (len(contract.scan.x), len(contract.scan.y), contract.scan.standing) == (17, 11, 0.278)
     assert contract.to_dict()["height_scan"] == load_yaml(SHIPPED / "policy.yaml")["height_scan"]
     assert read_contract(ROOT / "resources/policies/go1_rough").scan is None
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda said: said.pop("height_scan"), "policy.yaml: 'height_scan' is missing; it must be a mapping"),
-        (
-            lambda said: said["height_scan"].pop("x"),
-            "policy.yaml: height_scan: 'x' is missing; it must be a list of numbers",
-        ),
-        (
-            lambda said: said["height_scan"]["y"].pop(),
-            "observation row 'height_scan' has size 187; height_scan has 170 values on this robot",
-        ),
-    ],
-)
-def test_a_wrong_scan_is_one_clear_line(change, message: str, export: Path) -> None:
-    said = load_yaml(export / "policy.yaml")
-    change(said)
-    save_yaml(export / "policy.yaml", said)
-    with pytest.raises(ContractError, match=re.escape(message)):
-        read_contract(export)
 
 
 def test_the_scan_is_the_environments(export: Path) -> None:
@@ -154,22 +128,6 @@ def test_around_the_steps_the_ground_goes_on(task: str) -> None:
             None,
         )
         assert hit == pytest.approx(5.0), (x, y)
-
-
-def test_too_many_steps_for_an_export_are_said() -> None:
-    many = {"levels": 1, "columns": 1, "tile": 24.0, "cell": 0.05, "border": 1.0, "difficulty": (1.0, 1.0), "seed": 1}
-    ground = make_terrain(proportions={"stepping_stones": 1.0}, **many)  # type: ignore[arg-type]
-    with pytest.raises(ModelError, match="tiles of stepping_stones are not level pieces, or more than 1000 of them"):
-        among_steps((SHIPPED / "scene.xml").read_text(), ground, [0.0, 0.0, 0.3])
-
-
-def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
-    (export / TERRAIN_FILE).unlink()
-    with pytest.raises(
-        ContractError,
-        match=r"no terrain.mjz in .*; an export has one if its task had steps or blocks; export an older one again",
-    ):
-        DeployStage(export, 1, scene_file=TERRAIN_FILE)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,9 +21,7 @@ from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.envs.snapshot import put_snapshot, take_snapshot
-from legged_mw.sim.model import ModelError
-from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import NotRecordable, StepError
+from legged_mw.utils.errors import NotRecordable
 from legged_mw.utils.task import load_task
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf
@@ -254,103 +251,7 @@ def test_base_task_alone_has_no_step() -> None:
             call()
 
 
-# ---- mistakes
-
-
-class _Column(LeggedRobot):
-    def _reward_pose(self) -> Tensor:
-        return super()._reward_pose()[:, None]
-
-
-class _Number(LeggedRobot):
-    def _reward_pose(self) -> Tensor:
-        return 1.0  # type: ignore[return-value]
-
-
-@pytest.mark.parametrize(
-    ("overrides", "env_class", "error", "message"),
-    [
-        (
-            {"rewards.scales.tracking_linvel": 2.0},
-            None,
-            ConfigError,
-            r"^rewards\.scales\.tracking_linvel = 2: no reward term 'tracking_linvel' in LeggedRobot \(a method _reward_<name>\); "
-            r"did you mean 'tracking_lin_vel'\? there are: action_rate, .*, tracking_lin_vel$",
-        ),
-        (
-            {},
-            _Column,
-            StepError,
-            r"^tests/test_env\.py:\d+, _Column\._reward_pose: must return a tensor \(3,\), one value an environment; it returned \(3, 1\)$",
-        ),
-        (
-            {},
-            _Number,
-            StepError,
-            r"_Number\._reward_pose: must return a tensor \(3,\), one value an environment; it returned float$",
-        ),
-        (
-            {"asset.imu_site": "FR"},
-            None,
-            ModelError,
-            r"^asset\.imu_site: 'FR' is on body 'FR_calf', which moves against the root 'trunk' by joint 'FR_calf_joint', so what it "
-            r"senses is not the root's; take a site or body that is fixed to the root, or hold that joint by held_joints$",
-        ),
-        (
-            {"asset.imu_site": "imo"},
-            None,
-            ModelError,
-            r"^asset\.imu_site: no site or body 'imo' in go1\.xml; did you mean 'imu'\? there are: .*imu",
-        ),
-        (
-            {"asset.foot_names": ["FR", "FL", "RR", "RX"]},
-            None,
-            ModelError,
-            r"^asset.foot_names or foot_geoms: no geom or body 'RX' in go1\.xml; there are: geoms .*, RL; bodies trunk, .*, RL_calf$",
-        ),
-        (
-            {"asset.file": ""},
-            None,
-            ConfigError,
-            r"^asset\.file is empty; name the robot's MJCF or URDF, e\.g\. 'resources/robots/go1/go1\.xml'$",
-        ),
-        (
-            {"control.damping": {"hip": 1.0}},
-            None,
-            ModelError,
-            r"^control\.damping: no value for FR_thigh_joint, FR_calf_joint, FL_thigh_joint",
-        ),
-        (
-            {"asset.colliders": ["paw"]},
-            None,
-            ModelError,
-            r"^asset\.colliders: no colliding geom or body 'paw' in go1\.xml; there are: geoms trunk_box",
-        ),
-        (
-            {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},
-            None,
-            ModelError,
-            r"^terrain\.tile_size: 7\.77 m must be a whole number of cells of 0\.\d+ m",
-        ),
-        (
-            {"rewards.pose_weights": {"hip": 1.0, "thigh": 1.0}},
-            None,
-            ModelError,
-            r"^rewards\.pose_weights: no value for FR_calf_joint, .*, RL_calf_joint: none of \['hip', 'thigh'\] is a part of these names; ",
-        ),
-        (
-            {"init_state.default_joint_angles": {"joint": 0.0, "toe": 1.0}},
-            None,
-            ModelError,
-            r"^init_state\.default_joint_angles: no joint 'toe' in the MJCF; there are: FR_hip_joint, .* \(a key may be a part",
-        ),
-    ],
-)
-def test_mistakes_are_named(
-    overrides: dict[str, Any], env_class: type[LeggedRobot] | None, error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        make_env(3, overrides, env_class=env_class)
+# ---- groups
 
 
 def test_groups_may_have_any_name() -> None:
@@ -810,11 +711,3 @@ def test_a_foot_feels_all_of_its_geoms(foot_geoms: dict[str, list[str]], felt: l
     env._update_state()
     assert env.foot_contact.tolist() == [[False, False], felt]
     assert all("*" not in geom for geoms in env.foot_geoms.values() for geom in geoms)
-
-
-def test_walking_needs_a_config_of_walking() -> None:
-    task = load_task(str(ROOT / "examples" / "go1_stand.py"))
-    with pytest.raises(
-        ConfigError, match="^LeggedRobot walks by command: it needs a LeggedRobotCfg, not a Go1StandCfg$"
-    ):
-        LeggedRobot(task.cfg, "cpu")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from learner import STEPS, WORLDS, collect, make, parameters
-from program import refused, trained
+from program import trained
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from test_deploy import main, put, rewrite, without
@@ -179,33 +179,6 @@ def task_with(**changes: Any) -> LoadedTask:
     return task
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"actor__estimator__targets": ["base_lin_vell"]},
-        {"actor__estimator__targets": ["state"]},
-        {"actor__estimator__targets": ["commands"]},
-        {"observations__foot_height": False},
-        {"actor__estimator__targets": ["base_lin_vel"] * 2},
-        {"obs_groups__actor": ["privileged_state"]},
-        {"algorithm__class_name": "PPO"},
-        {"algorithm__optimizer": "sgd"},
-        {"actor__class_name": "CNNModel"},
-    ],
-    ids="".join,
-)
-def test_an_estimator_that_cannot_be(changes: dict[str, Any]) -> None:
-    task = task_with(**changes)
-    with pytest.raises(ConfigError, match="^actor.estimator.targets"):
-        make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
-
-
-def test_what_a_teacher_estimates_must_be_known_here() -> None:
-    task = task_with(actor__estimator__targets=[], observations__foot_height=False)
-    with pytest.raises(ConfigError, match="^the teacher's .*'foot_height'"):
-        make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu", task_with().train)
-
-
 def test_what_is_randomized_can_be_estimated_and_the_policy_acts_in_nominal_worlds(tmp_path: Path) -> None:
     task = task_with(
         **{
@@ -229,13 +202,6 @@ def test_what_is_randomized_can_be_estimated_and_the_policy_acts_in_nominal_worl
 def test_check_says_what_is_estimated() -> None:
     task = task_with()
     assert "\nthe actor estimates foot_height (4), base_lin_vel (3)\n" in describe(LeggedRobot(task.cfg, "cpu"), task)
-
-
-def test_it_is_one_line_of_the_program(tmp_path: Path) -> None:
-    line = refused(
-        tmp_path, "train", "--task", "go1_flat", "--device", "cpu", "--set", "actor.estimator.targets=[velocity]"
-    )
-    assert line.startswith("train.py: actor.estimator.targets: no observation row 'velocity' in 'privileged_state'; ")
 
 
 def test_without_targets_the_actor_is_rsl_rls_own() -> None:

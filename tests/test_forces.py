@@ -212,15 +212,13 @@ def test_a_sensor_of_the_file_is_kept_where_it_is_asked_for(engine: str, tmp_pat
 
 
 @pytest.mark.parametrize("name", ["contact_forces", "self_contacts", "angular_momentum"])
-def test_what_is_not_sensed_says_how_to_get_it(name: str) -> None:
+def test_what_is_asked_for_is_sensed(name: str) -> None:
+    """tests/golden/tasks.py has what is said where it is not."""
+
     class Fallen(LeggedRobot):
         def _fallen(self) -> Tensor:
             return super()._fallen() | (getattr(self, name).flatten(1).abs().amax(dim=1) > 1e6)
 
-    error = f"{name} is not sensed; write asset.sense = ['{name}'] in the config"
-    with pytest.raises(ConfigError) as raised:
-        make_env(1, QUIET, env_class=Fallen).step(torch.zeros(1, 12))
-    assert str(raised.value) == error
     make_env(1, {**QUIET, "asset.sense": [name]}, env_class=Fallen).step(torch.zeros(1, 12))
 
 
@@ -334,57 +332,6 @@ def test_sensed_motion_and_self_contacts() -> None:
     env.sim.sensordata[:, spans[SELF_CONTACT]] = torch.tensor([[2.0], [0.0]])
     assert term(env, "angular_momentum") == [14.0, 0.25]
     assert term(env, "self_collision") == [2.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("name", "more", "error"),
-    [
-        (
-            "self_collision",
-            {},
-            "rewards.scales.self_collision is on, but asset.self_collisions is False, so that parts pass through one another",
-        ),
-        (
-            "joint_mirror",
-            {},
-            "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]",
-        ),
-        (
-            "joint_mirror",
-            {"rewards.mirror_joints": [["FR", "RL_hip"]]},
-            "['FR', 'RL_hip'] must be two names or patterns that mean as many joints",
-        ),
-        (
-            "joint_mirror",
-            {"rewards.mirror_joints": [["FR", "XX"]]},
-            "rewards.mirror_joints: no joint 'XX' in the robot",
-        ),
-        (
-            "joint_mirror",
-            {"rewards.mirror_joints": [["FR"]]},
-            "rewards.mirror_joints is [['FR']]; it must be pairs: lists of two names or patterns each",
-        ),
-        (
-            "dof_vel_limits",
-            {"asset.joint_speed_limits": {}},
-            "no joint has a highest speed; write asset.joint_speed_limits",
-        ),
-        (
-            "stumble",
-            {"asset.sense": ["forces"]},
-            "asset.sense: no value or sensor 'forces' in LeggedRobot and its file; did you mean 'contact_forces'",
-        ),
-        (
-            "feet_contact_forces",
-            {"rewards.max_contact_force": -1.0},
-            "rewards.max_contact_force is -1.0; it must be 0 or more",
-        ),
-    ],
-)
-def test_what_a_term_lacks(name: str, more: dict[str, Any], error: str) -> None:
-    with pytest.raises(ConfigError) as raised:
-        make_env(1, {**only_scales(**{name: -1.0}), **more})
-    assert error in str(raised.value)
 
 
 # ---- the whole body, against the ground and itself

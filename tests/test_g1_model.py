@@ -354,15 +354,6 @@ def test_colliding_geom(model: mujoco.MjModel, shape: str) -> None:
         assert abs(rotation(geom.quat)[:, 2] @ flip @ rotation(quat)[:, 2]) == pytest.approx(1.0, abs=1e-9), name
 
 
-def test_it_states_facts_only(model: mujoco.MjModel) -> None:
-    """Servos, sensors, ground, lights and cameras are the choices of whoever loads it."""
-    assert (model.nu, model.nsensor, model.nlight, model.ncam, model.neq, model.nexclude) == (0,) * 6
-    text = XML.read_text()
-    for word in ("file=", "<option", "<include", "<actuator", "<sensor"):
-        assert word not in text
-    assert "Menagerie" in text and "BSD-3-Clause" in text and len(text) < 60_000
-
-
 def test_joints(model: mujoco.MjModel) -> None:
     assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and len(JOINTS) == 29
     assert [model.joint(i).name for i in range(1, model.njnt)] == [f"{name}_joint" for name in JOINTS]
@@ -379,13 +370,6 @@ def test_joints(model: mujoco.MjModel) -> None:
         assert (joint.armature[0], joint.frictionloss[0], joint.damping[0]) == (armature, 0.1, 0.0), name
 
 
-def test_the_free_joint_is_free(model: mujoco.MjModel) -> None:
-    """The defaults of the hinges must not leak into it."""
-    for values in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
-        np.testing.assert_array_equal(values[:6], 0.0)
-    assert model.jnt_limited[0] == 0 and model.jnt_actfrclimited[0] == 0
-
-
 def test_sites(model: mujoco.MjModel) -> None:
     places = {"imu_in_pelvis": ("pelvis", (0.04525, 0.0, -0.08339))}
     places |= {f"{side}_foot": (f"{side}_ankle_roll_link", (0.04, 0.0, -0.037)) for side in ("left", "right")}
@@ -393,18 +377,6 @@ def test_sites(model: mujoco.MjModel) -> None:
         assert model.body(model.site(name).bodyid[0]).name == body
         np.testing.assert_array_equal(model.site(name).pos, place)
         np.testing.assert_array_equal(model.site(name).quat, _ONE)
-
-
-def test_looks_weigh_nothing_and_touch_nothing(model: mujoco.MjModel) -> None:
-    spec = mujoco.MjSpec.from_file(str(XML))
-    looks = [geom for geom in spec.geoms if geom.group == 2]
-    assert all(geom.mass == 0.0 and (geom.contype, geom.conaffinity) == (0, 0) and geom.material for geom in looks)
-    assert {geom.group for geom in spec.geoms} == {2, 3}
-    spec.compiler.discardvisual = True
-    bare = spec.compile()
-    assert bare.ngeom == 33
-    for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "dof_invweight0"):
-        np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
 
 
 def test_home(model: mujoco.MjModel, home: mujoco.MjData) -> None:
@@ -418,23 +390,6 @@ def test_home(model: mujoco.MjModel, home: mujoco.MjData) -> None:
     for side in ("left", "right"):  # the sole is 0.8 mm above the ground, the site 2 mm lower
         assert home.site(f"{side}_foot").xpos[2] == pytest.approx(-0.0012, abs=1e-4)
         np.testing.assert_allclose(home.site(f"{side}_foot").xmat.reshape(3, 3), np.eye(3), rtol=0, atol=1e-6)
-
-
-def test_every_link_is_seen_the_same_from_left_and_right(model: mujoco.MjModel, home: mujoco.MjData) -> None:
-    """Bounding boxes at home within 0.2 mm: the right shoulder is published 10 um off, round shapes have facets."""
-    seen = np.flatnonzero(model.geom_group == 2)
-    assert set(model.geom_bodyid[seen]) == set(range(1, model.nbody))
-    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    boxes = []
-    for i in seen:
-        middle, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
-        points = home.geom_xpos[i] + (middle + half * corners) @ home.geom_xmat[i].reshape(3, 3).T
-        boxes.append([model.geom_matid[i], *points.min(0), *points.max(0)])
-    boxes = np.array(boxes)
-    mirrored = boxes.copy()
-    mirrored[:, 2], mirrored[:, 5] = -boxes[:, 5], -boxes[:, 2]
-    distance = np.abs(boxes[:, None] - mirrored[None]).max(-1).min(1)
-    assert distance.max() < 2e-4, model.geom(int(seen[distance.argmax()]))
 
 
 def test_its_export_is_a_small_text() -> None:

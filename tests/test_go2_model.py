@@ -20,7 +20,6 @@ LINK_NAMES = [f"{leg}_{link}" for leg in LEGS for link in LINKS]
 TOTAL_MASS = 15.20641
 FOOT_RADIUS, FOOT_POS = 0.022, (-0.002, 0.0, -0.213)
 IMU = (-0.02557, 0.0, 0.04232)
-STANCE = {"hip": (0.1, -0.1), "thigh": (0.8, 1.0), "calf": (-1.5, -1.5)}  # hip: left, right; else front, rear
 
 # mass, com, quaternion of the inertia, principal moments
 _HIP, _THIGH, _CALF = (
@@ -96,17 +95,6 @@ def model() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(XML))
 
 
-def test_it_states_facts_only(model: mujoco.MjModel) -> None:
-    """Servos, sensors, ground, lights, cameras and the pose to stand in are the choices of whoever loads it."""
-    assert (model.nu, model.nsensor, model.nlight, model.ncam, model.neq, model.nexclude, model.nkey) == (0,) * 7
-    assert not np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-    assert (model.nq, model.nv) == (19, 18)
-    text = XML.read_text()
-    for word in ("file=", "<option", "<include", "<actuator", "<sensor"):
-        assert word not in text
-    assert "Menagerie" in text and "BSD-3-Clause" in text
-
-
 def test_order_and_frames(model: mujoco.MjModel) -> None:
     """Bodies and joints as published: left before right, unlike the motors' order."""
     assert [model.body(i).name for i in range(model.nbody)] == ["world", "base", *LINK_NAMES]
@@ -150,13 +138,6 @@ def test_joint(model: mujoco.MjModel, name: str) -> None:
     assert (joint.armature[0], joint.damping[0], joint.frictionloss[0], joint.stiffness[0]) == (0.01, 2.0, 0.2, 0.0)
 
 
-def test_the_free_joint_is_free(model: mujoco.MjModel) -> None:
-    """The defaults of the hinges must not leak into it."""
-    for values in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
-        np.testing.assert_array_equal(values[:6], 0.0)
-    assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and model.jnt_limited[0] == model.jnt_actfrclimited[0] == 0
-
-
 def test_what_collides(model: mujoco.MjModel) -> None:
     assert np.count_nonzero(model.geom_contype) == sum(len(shapes(body)) for body in INERTIALS) == 23
     for body in INERTIALS:
@@ -196,54 +177,8 @@ def test_legs_are_mirror_images(model: mujoco.MjModel, pair: tuple[str, str]) ->
         np.testing.assert_allclose(compiled_tensor(model, left), expected, rtol=0, atol=1e-9)
 
 
-def test_visual_geoms_weigh_nothing_and_touch_nothing(model: mujoco.MjModel) -> None:
-    spec = mujoco.MjSpec.from_file(str(XML))
-    visual = [g for g in spec.geoms if g.group == 2]
-    assert {g.parent.name for g in visual} == set(INERTIALS), "every body is to be seen"
-    for geom in visual:
-        assert geom.mass == 0.0 and (geom.contype, geom.conaffinity) == (0, 0)
-        assert geom.material, "a colour by name, not by chance"
-    spec.compiler.discardvisual = True
-    bare = spec.compile()
-    assert (bare.ngeom, bare.nmesh, bare.nmat) == (23, 0, 0)
-    for field in (
-        "body_mass",
-        "body_ipos",
-        "body_iquat",
-        "body_inertia",
-        "body_invweight0",
-        "dof_invweight0",
-        "site_pos",
-    ):
-        np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
-
-
 def test_an_exported_scene_stays_small() -> None:
     """A built-in mesh is written out vertex by vertex: few and coarse ones only."""
     spec = mujoco.MjSpec.from_file(str(XML))
     spec.compile()
     assert len(spec.to_xml()) < 45_000
-
-
-def test_it_looks_the_same_from_left_and_right(model: mujoco.MjModel) -> None:
-    """Every visible geom has a mirror image of the same material: compared by bounding boxes in a stance."""
-    data = mujoco.MjData(model)
-    for name in LINK_NAMES:
-        leg, link = name.split("_")
-        data.joint(f"{name}_joint").qpos = STANCE[link][leg[1] == "R" if link == "hip" else leg[0] == "R"]
-    mujoco.mj_kinematics(model, data)
-    boxes = []
-    for i in np.flatnonzero(model.geom_group == 2):
-        if (mesh := model.geom_dataid[i]) >= 0:
-            start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-            points = model.mesh_vert[start : start + count]
-        else:
-            center, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
-            points = center + half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-        world = data.geom_xpos[i] + points @ data.geom_xmat[i].reshape(3, 3).T
-        boxes.append([model.geom_matid[i], *world.min(0), *world.max(0)])
-    boxes = np.array(boxes)
-    mirrored = boxes.copy()
-    mirrored[:, 2], mirrored[:, 5] = -boxes[:, 5], -boxes[:, 2]
-    # 0.2 mm: the facets of a round shape need not be mirrored
-    assert np.abs(boxes[:, None] - mirrored[None]).max(-1).min(1).max() < 2e-4

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from golden.own_code import ANNEAL, END_STEP, INIT, REWARD, TABLE, watched_task
 from torch import Tensor
 
 from legged_mw.check.guard import check_recordable, not_remembered
 from legged_mw.check.recordable import recordable
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import NotRecordable, StepError
+from legged_mw.utils.errors import NotRecordable
 from legged_mw.utils.task import load_task
 
 X = torch.arange(6.0).view(2, 3)
@@ -189,267 +190,13 @@ def test_guard_ends_with_its_block() -> None:
 
 # ---- a task of one's own: each mistake is one line of text ------------------------------------------------------------------
 
-HEAD = """
-import random
-from collections import deque
-
-import numpy as np
-import torch
-from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
-from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.observations import Row
-from legged_mw.utils.task import Task
-
-RNG, AT_IMPORT = np.random.default_rng(1), torch.ones(4)
-
-
-class Slots:
-    __slots__ = ("one",)
-
-    def __init__(self, like):
-        self.one = torch.zeros_like(like)
-
-
-class Buffers:
-    def __init__(self, like):
-        self.kept = {"past": torch.zeros_like(like)}
-
-
-class Mine(LeggedRobot):
-    def _init_buffers(self):
-        super()._init_buffers()
-        self.foot, self.rows = (torch.tensor(i, device=self.device) for i in (1, [0, 2]))
-        self.past, self.list, self.count = self.buffer(), [self.buffer()], 0
-        self.parts, self.slots, self.view = Buffers(self.past), Slots(self.past), self.dof_pos[:, :3]
-        self.frames = deque([self.past, self.parts.kept["past"]])
-        self.moved, self.net = torch.zeros(self.num_envs).to(self.device), torch.nn.Linear(1, 1).to(self.device).requires_grad_(False)
-
-"""
-REWARD = """
-    def _reward_pose(self):
-        {}  # here
-        return self.past * 0.0
-"""
-END_STEP = """
-    def _end_step(self):
-        super()._end_step()
-        {}  # here
-"""
-ANNEAL = """
-    def on_training_progress(self, share):
-        super().on_training_progress(share)
-        {}  # here
-"""
-LOAD = """
-    def load_training_state(self, state):
-        super().load_training_state(state)
-        {}  # here
-"""
-REDRAW = """
-    def _init_ranges(self):
-        super()._init_ranges()
-        redraw = self.domain_rand.redraw
-
-        def drawn():
-            redraw()
-            {}  # here
-
-        self.domain_rand.redraw = drawn
-"""
-INIT = """
-    def _init_ranges(self):
-        super()._init_ranges()
-        {}  # here
-
-    def _end_step(self):
-        super()._end_step()
-        self.past.add_(self.own.sum())
-"""
-TABLE = """
-    def observation_rows(self):  # here
-        rows = super().observation_rows()
-        rows["state"].append({})
-        return rows
-"""
-TAIL = """
-
-TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)
-"""
-CONDITION = "a tensor as a condition (if, and, not, in) is read to the host; write torch.where(condition, a, b)"
-SCALAR = "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
-MASK_INDEX = (
-    "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
-)
-MADE_ONCE = "becomes another tensor; make it once, in __init__, and write in place"
-PAST = f"self.past {MADE_ONCE}: self.past.copy_(...)"
-NUMBER = "self.count is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
-ON_HOST = "without a device makes a tensor on the host, which the step reads; add device=self.device"
-DRAWS = "draws Python's or numpy's random numbers, but a replay repeats what was recorded; write torch.rand(..., device=self.device)"
-BREACHES: dict[str, tuple[str, str, str]] = {
-    "column by a scalar tensor": (REWARD, "self.foot_height[:, self.foot].clone()", f"Mine._reward_pose: {SCALAR}"),
-    "item": (
-        REWARD,
-        "self.dt * self.foot.item()",
-        "Mine._reward_pose: item() reads a tensor to the host; keep it a tensor and compute with that",
-    ),
-    "if": (REWARD, "1 if self.commands.sum() > 0 else 2", f"Mine._reward_pose: {CONDITION}"),
-    "boolean index": (END_STEP, "self.past[self.fell] = 0.0", f"Mine._end_step: {MASK_INDEX}"),
-    "torch.tensor": (
-        REWARD,
-        "torch.tensor([1.0])",
-        "Mine._reward_pose: tensor() copies data from the host; make the tensor once, in __init__",
-    ),
-    "no device": (
-        REWARD,
-        "torch.zeros(2)",
-        "Mine._reward_pose: zeros() without a device makes a tensor on the host; add device=self.device",
-    ),
-    "nonzero": (
-        END_STEP,
-        "self.fell.nonzero()",
-        "Mine._end_step: nonzero has a shape that depends on data; keep every row, and write torch.where(mask, a, b)",
-    ),
-    "rebound": (
-        END_STEP,
-        "self.past = self.past + 1.0",
-        f"Mine._end_step: self.past {MADE_ONCE}: self.past.copy_(...)",
-    ),
-    "rebound view": (
-        END_STEP,
-        "self.view = self.dof_vel[:, :3]",
-        f"Mine._end_step: self.view {MADE_ONCE}: self.view.copy_(...)",
-    ),
-    "rebound in a part": (
-        END_STEP,
-        "self.parts.kept['past'] = self.past.abs()",
-        f"Mine._end_step: self.parts.kept.past {MADE_ONCE}: self.parts.kept.past.copy_(...)",
-    ),
-    "rebound in the simulation": (
-        END_STEP,
-        "self.sim.qpos = self.sim.qpos.abs()",
-        f"Mine._end_step: self.sim.qpos {MADE_ONCE}: self.sim.qpos.copy_(...)",
-    ),
-    "list that grows": (
-        END_STEP,
-        "self.list.append(self.past.clone())",
-        f"Mine._end_step: self.list[2] {MADE_ONCE}: self.list[2].copy_(...)",
-    ),
-    "number": (END_STEP, "self.count += 1", f"Mine._end_step: {NUMBER}"),
-    "number that a training changes": (ANNEAL, "self.count = 2.0 * share", f"Mine.on_training_progress: {NUMBER}"),
-    "number of the config that a training changes": (
-        ANNEAL,
-        "self.cfg.rewards.base_height_target = 0.3 * share",
-        f"Mine.on_training_progress: {NUMBER.replace('self.count', 'self.cfg.rewards.base_height_target')}",
-    ),
-    "rebound by a training": (ANNEAL, "self.past = self.past + share", f"Mine.on_training_progress: {PAST}"),
-    "number that a redraw changes": (REDRAW, "self.count += 1", f"drawn: {NUMBER}"),
-    "rebound by a checkpoint": (
-        LOAD,
-        "self.past = self.past.clone()",
-        f"Mine.load_training_state: {PAST}",
-    ),
-    "rebound in a deque": (
-        END_STEP,
-        "self.frames.rotate()",
-        f"Mine._end_step: self.frames[0] {MADE_ONCE}: self.frames[0].copy_(...)",
-    ),
-    "rebound in slots": (
-        END_STEP,
-        "self.slots.one = self.past * 2",
-        f"Mine._end_step: self.slots.one {MADE_ONCE}: self.slots.one.copy_(...)",
-    ),
-    "Python's random numbers": (REWARD, "self.dt * random.random()", f"Mine._reward_pose: {DRAWS}"),
-    "numpy's random numbers": (END_STEP, "self.past += np.random.rand()", f"Mine._end_step: {DRAWS}"),
-    "a generator of numpy's": (END_STEP, "self.past += RNG.normal()", f"Mine._end_step: {DRAWS}"),
-    "a buffer without a device": (
-        INIT,
-        "self.own = torch.zeros(self.num_envs)",
-        f"Mine._init_ranges: zeros() {ON_HOST}",
-    ),
-    "computed from a number without a device": (
-        INIT,
-        "self.own = torch.tensor(0.5).expand(4)",
-        f"Mine._init_ranges: tensor() {ON_HOST}",
-    ),
-    "computed without a device": (
-        INIT,
-        "self.own = {'a': torch.arange(3)[None] / 2.0 + 1.0}['a']",
-        f"Mine._init_ranges: arange() {ON_HOST}",
-    ),
-    "a network without a device": (
-        INIT,
-        "self.own = torch.nn.Linear(1, 1).weight.detach()",
-        f"Mine._init_ranges: empty() {ON_HOST}",
-    ),
-    "writes": (
-        REWARD,
-        "self.past += 1.0",
-        "Mine._reward_pose: writes to self.past; a reward only reads: write to it in _update_state or _end_step",
-    ),
-    "writes to a view": (
-        REWARD,
-        "self.last_actions[:, 0].mul_(2.0)",
-        "Mine._reward_pose: writes to self._episode; a reward only reads: write to it in _update_state or _end_step",
-    ),
-    "computed row": (
-        TABLE,
-        "Row('speed', self.base_lin_vel * 2.0)",
-        "Mine.observation_rows: row 'speed' of 'state' is computed when the table is made, which is once; "
-        "give it a buffer, which _update_state writes in place",
-    ),
-}
-MISTAKES: dict[str, tuple[str, str, str]] = {
-    "raises": (
-        END_STEP,
-        "self.past.add_(self.dof_pos)",
-        "Mine._end_step: RuntimeError: The size of tensor a (4) must match the size of tensor b (12) at non-singleton dimension 1",
-    ),
-    "unknown name": (
-        REWARD,
-        "self.speed",
-        "Mine._reward_pose: AttributeError: 'Mine' object has no attribute 'speed'; did you mean 'foot_speed'?",
-    ),
-    "shape": (
-        "\n    def _reward_pose(self):  # here\n        return {}\n",
-        "self.dof_pos.square()",
-        "Mine._reward_pose: must return a tensor (4,), one value an environment; it returned (4, 12)",
-    ),
-    "NaN": (
-        "\n    def _reward_pose(self):  # here\n        return {}\n",
-        "(self.base_height - 100.0).sqrt()",
-        "Mine._reward_pose: returned a value that is not finite; look for a division by 0 or a root of a negative number",
-    ),
-    "row of NaN": (
-        TABLE,
-        "Row('past', self.past.fill_(torch.nan)[:, None])",
-        "Mine.observation_rows: row 'past' of 'state' is not finite, or beyond 1e+06",
-    ),
-}
-
 
 def _task(folder: Path, body: str, line: str) -> tuple[Any, str]:
     """A task of one's own, and ``file:line`` of its line that is marked."""
     file = folder / "mine.py"
-    file.write_text(HEAD + body.format(line) + TAIL)
+    file.write_text(watched_task(body, line))
     number = 1 + next(i for i, text in enumerate(file.read_text().splitlines()) if text.endswith("# here"))
     return load_task(str(file)), f"{file}:{number}"
-
-
-@pytest.mark.parametrize(("body", "line", "text"), BREACHES.values(), ids=BREACHES)
-def test_what_cannot_be_recorded_is_named_by_line(tmp_path: Path, body: str, line: str, text: str) -> None:
-    task, where = _task(tmp_path, body, line)
-    with pytest.raises(NotRecordable) as raised:
-        check_recordable(task)
-    assert str(raised.value) == f"mine: {where}, {text}"
-
-
-@pytest.mark.parametrize(("body", "line", "text"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_is_named_by_line(tmp_path: Path, body: str, line: str, text: str) -> None:
-    task, where = _task(tmp_path, body, line)
-    with pytest.raises(StepError) as raised:
-        check_recordable(task)
-    assert str(raised.value) == f"mine: {where}, {text}"
-    assert not isinstance(raised.value, NotRecordable)
 
 
 def test_a_tensor_that_a_file_holds_is_named(tmp_path: Path) -> None:

@@ -14,12 +14,11 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.drive import LIFT
 from legged_mw.deploy.joint_check import STEP, JointCheck
-from legged_mw.deploy.robot import Floats, Robot, RobotError
+from legged_mw.deploy.robot import Floats, Robot
 from legged_mw.deploy.runner import Summary, run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import SOFT
 from legged_mw.unitree.faults import parse_faults
-from legged_mw.utils.errors import UserError
 from tests.wires import POLICIES, pair
 from tests.wires import domain as domain
 
@@ -168,15 +167,3 @@ def test_the_program_ends_with_code_1(capfd: pytest.CaptureFixture[str], monkeyp
     with pytest.raises(SystemExit) as ended:
         program.main()
     assert ended.value.code == 1 and "0 of 12 joints checked; ended early: start: joint check" in capfd.readouterr().out
-
-
-def test_what_it_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["deploy", str(GO2), "--check_joints", "--command", "1,0,0"])
-    with pytest.raises(UserError, match="--check_joints moves one joint of a robot at a time: leave --command out"):
-        program.main()
-    robot = Wired()
-    robot.can_change_gains = False
-    with pytest.raises(
-        RobotError, match="--check_joints is soft, and Wired cannot change its gains: no joint was moved"
-    ):
-        checked(robot)

@@ -144,18 +144,6 @@ def test_the_documented_task_trains_resumes_and_exports(tmp_path: Path) -> None:
 # ---- config
 
 
-@pytest.mark.parametrize(
-    ("setting", "text"),
-    [
-        ("actor.rnn_type=grru", "actor.rnn_type must be Literal['gru', 'lstm'], not 'grru' (str); did you mean 'gru'?"),
-        ("critic.rnn_hidden_dim=0", "critic.rnn_hidden_dim is 0; it must be 1 or more"),
-        ("actor.rnn_num_layers=0", "actor.rnn_num_layers is 0; it must be from 1 to 1000"),
-    ],
-)
-def test_a_memory_that_cannot_be_made(setting: str, text: str, tmp_path: Path) -> None:
-    assert text in refused(tmp_path, "train", *SMALL, "--set", "actor.class_name=RNNModel", "--set", setting)
-
-
 def test_only_a_network_with_a_memory_gets_its_fields() -> None:
     task = small_task("lstm", 2)
     task.set("critic.class_name", "MLPModel")

@@ -2,7 +2,6 @@
 
 import sys
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
 from legged_mw.skills.clip import Clip, ClipError, checked, from_rotation_vector, read_clip, save_clip
 from legged_mw.skills.kinematics import Kinematics
-from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import load_task
 
 CLIPS = sorted((ROOT / "resources/motions").glob("*.npz"))
@@ -54,14 +52,6 @@ def test_a_clip_at_another_rate_is_the_same_motion() -> None:
     np.testing.assert_allclose(clip.qvel(), np.tile([1.0, 0, 0, *(2 * AXIS), 3.0], (51, 1)), atol=1e-9)
 
 
-@pytest.mark.parametrize("rate", [0.9, 0.0, -50.0])
-def test_a_rate_that_leaves_no_two_frames_is_refused(rate: float) -> None:
-    with pytest.raises(
-        ClipError, match=f"1 s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip"
-    ):
-        steady().at(rate)
-
-
 def test_signs_of_quaternions_do_not_jump(tmp_path: Path) -> None:
     clip = steady()
     flipped = clip._replace(root_quat=clip.root_quat * np.where(np.arange(31) % 2, -1.0, 1.0)[:, None])
@@ -77,8 +67,6 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
         read = read_motion(tmp_path / name, g1)
         assert read.fps == 30.0 and read.joint_names == g1.joint_names
         np.testing.assert_allclose(read.qpos(), clip.qpos(), atol=1e-7)
-    with pytest.raises(ClipError, match="no frame rate"):
-        read_motion(tmp_path / "plain.csv", g1, 0.0)
     for name, text in (("text.csv", "abc\n"), ("comment.csv", "# abc\n"), ("empty.csv", "")):
         (tmp_path / name).write_text(text)
         with (
@@ -86,11 +74,6 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
             pytest.raises(ClipError, match=f"{name} cannot be read as a CSV of numbers: it"),
         ):
             read_motion(tmp_path / name, g1)
-    np.savetxt(tmp_path / "legs.csv", table[:, :19], delimiter=",")
-    with pytest.raises(
-        ClipError, match="legs.csv has 19 columns; of this robot it must have 36: root x y z, quaternion x y z w"
-    ):
-        read_motion(tmp_path / "legs.csv", g1)
 
 
 @pytest.mark.parametrize("order", ["as in the robot's file", "breadth first"])
@@ -113,46 +96,6 @@ def test_bodies_tell_the_order_of_joints(order: str, g1: RobotModel, tmp_path: P
     }
     np.savez(tmp_path / "theirs.npz", **held)
     np.testing.assert_allclose(read_motion(tmp_path / "theirs.npz", g1).qpos(), clip.qpos(), atol=1e-6)
-    np.savez(tmp_path / "theirs.npz", **{**held, "joint_pos": held["joint_pos"][:, ::-1]})
-    with pytest.raises(ClipError, match="with its joints in either order .* another robot"):
-        read_motion(tmp_path / "theirs.npz", g1)
-
-
-WRONG: list[tuple[Callable[[Clip], Any], str]] = [
-    (lambda clip: clip._replace(joint_names=("ankle",)), "no joint 'knee' in the clip"),
-    (lambda clip: clip._replace(root_quat=2 * clip.root_quat), "a quaternion that is not of unit length"),
-    (lambda clip: clip._replace(root_pos=clip.root_pos[:5]), "there must be two frames or more"),
-]
-
-
-@pytest.mark.parametrize(("change", "said"), WRONG, ids=[said for _, said in WRONG])
-def test_a_wrong_clip(change: Callable[[Clip], Clip], said: str, tmp_path: Path) -> None:
-    save_clip(tmp_path / "clip.npz", change(steady()))
-    with pytest.raises(ClipError, match=said):
-        read_clip(tmp_path / "clip.npz").of(["knee"], "clip.npz")
-    np.savez(tmp_path / "other.npz", joint_pos=[1.0])
-    with pytest.raises(
-        ClipError,
-        match="is no clip of legged_mw, for it has no 'fps'; convert it with: python -m legged_mw.motion other.npz",
-    ):
-        read_clip(tmp_path / "other.npz")
-
-
-@pytest.mark.parametrize("kind", ["empty", "cut", "one array", "missing"])
-def test_a_damaged_clip_is_refused_in_one_line(kind: str, g1: RobotModel, tmp_path: Path) -> None:
-    file = tmp_path / "clip.npz"
-    save_clip(file, steady())
-    whole = file.read_bytes()
-    file.unlink()
-    if kind == "one array":
-        np.save(file.with_suffix(".npy"), np.zeros(3))
-        file.with_suffix(".npy").rename(file)
-    elif kind != "missing":
-        file.write_bytes(whole[:500] if kind == "cut" else b"")
-    with pytest.raises(ClipError, match="clip.npz cannot be read as a clip: "):
-        read_clip(file)
-    with pytest.raises(ClipError, match="clip.npz cannot be read as a motion: "):
-        read_motion(file, g1)
 
 
 @pytest.mark.parametrize("file", CLIPS, ids=lambda file: file.stem)
@@ -213,5 +156,3 @@ def test_kinematics_are_mujocos(g1: RobotModel, double: None) -> None:
         right = (data.xpos[body], data.xmat[body].reshape(3, 3), speed[3:], speed[:3])
         for ours, theirs in zip(found, right, strict=True):
             np.testing.assert_allclose(ours[0, i].numpy(), theirs, atol=1e-12)
-    with pytest.raises(ModelError, match="body 'world' is not carried by the robot's root 'pelvis'"):
-        Kinematics(model, [0], "cpu")

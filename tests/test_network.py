@@ -10,7 +10,7 @@ import onnx
 import pytest
 import torch
 from onnx import numpy_helper
-from program import SMALL, refused, run
+from program import run
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from worlds import make_env
@@ -116,11 +116,6 @@ def test_half_precision_is_deployed(half: tuple[Path, Exported]) -> None:
     for _ in range(5):
         stage.step(None)
     assert not stage.fell().any()
-
-
-def test_half_needs_an_export(tmp_path: Path) -> None:
-    line = refused(tmp_path, "play", *SMALL[:2], "--half")
-    assert "--half rounds what is exported: add --export DIR" in line
 
 
 def renamed(model: Any) -> None:

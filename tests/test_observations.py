@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 from worlds import QUIET, STATE, layout, make_env
-
-from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.observations import Row
-from legged_mw.utils.config import ConfigError
 
 
 def test_rows_left_out_are_gone_from_the_group_and_from_what_contains_it() -> None:
@@ -94,66 +89,3 @@ def test_a_restart_between_steps_leaves_histories_of_other_worlds() -> None:
         )
     frames = now["state"][1, env.observations.span("state", "dof_vel")].unflatten(0, (4, 12))
     assert torch.equal(frames, frames[-1:].expand(4, 12))
-
-
-def test_a_history_without_the_gyros_has_no_mirror_image() -> None:
-    env = make_env(2, {"observations.history": {"state.base_lin_vel": 3}})
-    with pytest.raises(
-        ConfigError, match=r"observations.history: 'state.base_lin_vel' has 3 frames, so 'base_ang_vel' needs as many"
-    ):
-        _ = env.mirror
-
-
-class _Twice(LeggedRobot):
-    def observation_rows(self) -> dict[str, list[Row | str]]:
-        table = super().observation_rows()
-        return {**table, "state": [*table["state"], Row("dof_vel", self.dof_vel)]}
-
-
-class _Backwards(LeggedRobot):
-    def observation_rows(self) -> dict[str, list[Row | str]]:
-        return dict(reversed(super().observation_rows().items()))
-
-
-class _Old(LeggedRobot):
-    def _observation_rows(self) -> dict[str, list[Row]]:
-        return {}
-
-
-@pytest.mark.parametrize(
-    ("overrides", "env_class", "message"),
-    [
-        (
-            {"observations.leave_out": {"stat": []}},
-            LeggedRobot,
-            "observations.leave_out: no group 'stat' in the observation table; did you",
-        ),
-        (
-            {"observations.leave_out": {"state": ["lin_vel"]}},
-            LeggedRobot,
-            "leave_out: no row 'lin_vel' in 'state'; did you mean 'base_lin_vel'",
-        ),
-        (
-            {"observations.history": {"state.gyro": 2}},
-            LeggedRobot,
-            "observations.history: no row 'gyro' in 'state'; there are: base_lin_vel",
-        ),
-        (
-            {"observations.history": {"states": 2}},
-            LeggedRobot,
-            "observations.history: no group 'states' in the observation table; did you",
-        ),
-        ({"observations.history": {"state": 0}}, LeggedRobot, r"observations.history\['state'\] is 0; it must be 1"),
-        (
-            {"observations.leave_out": {"state": [*STATE]}},
-            LeggedRobot,
-            "observations.leave_out: 'state' has no row left; leave one in",
-        ),
-        ({}, _Twice, "observation group 'state' has two rows 'dof_vel'"),
-        ({}, _Backwards, "observation group 'privileged_state': no group 'state' in the groups that come before it"),
-        ({}, _Old, "_Old._observation_rows: the method is now called observation_rows"),
-    ],
-)
-def test_what_is_not_there_is_named(overrides: dict[str, object], env_class: type[LeggedRobot], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        make_env(2, overrides, env_class=env_class)

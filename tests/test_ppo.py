@@ -15,7 +15,6 @@ from rsl_rl.models import MLPModel
 from legged_mw.rl.layers import Linear
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.rsl_rl_settings import rsl_rl_config
-from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
 SYMMETRY = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}
@@ -196,33 +195,10 @@ def test_a_rate_of_a_checkpoint_comes_down_to_the_bound() -> None:
     assert same.learning_rate == pytest.approx(8e-3)
 
 
-def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
-    with pytest.raises(
-        ConfigError,
-        match=r"max_learning_rate is of the recorded update, and this is rsl-rl's own: the optimizer is SGD",
-    ):
-        make(GraphedPPO, max_learning_rate=2e-3, optimizer="sgd")
-    task = load_task("go1_flat")
-    task.set("algorithm.max_learning_rate", "0.002")
-    task.set("algorithm.class_name", "PPO")
-    with pytest.raises(ConfigError, match=r"rsl-rl's own PPO goes up to 0\.01; GraphedPPO takes another"):
-        rsl_rl_config(task.train)
-    task = load_task("go1_flat")
-    task.set("algorithm.max_learning_rate", "0.0005")
-    with pytest.raises(
-        ConfigError, match=r"algorithm.learning_rate is 0\.001, above algorithm.max_learning_rate, 0\.0005; begin"
-    ):
-        rsl_rl_config(task.train)
-
-
-def test_a_bound_beside_a_fixed_rate_is_refused() -> None:
+def test_the_default_bound_is_no_bound_of_a_fixed_rate() -> None:
     task = load_task("go1_flat")
     task.set("algorithm.schedule", "fixed")
-    assert "max_learning_rate" not in rsl_rl_config(task.train)["algorithm"]  # the default is not refused
-    task.set("algorithm.max_learning_rate", "0.002")
-    text = r"max_learning_rate is 0\.002, but algorithm.schedule is 'fixed', .* Leave the bound at 0\.01, or take the schedule 'adaptive'"
-    with pytest.raises(ConfigError, match=text):
-        rsl_rl_config(task.train)
+    assert "max_learning_rate" not in rsl_rl_config(task.train)["algorithm"]
 
 
 class Encoder(MLPModel):

@@ -16,7 +16,7 @@ from learner import difference
 from legged_mw import ROOT
 from legged_mw.rl.ranks import Rank, rank_device, this_rank
 from legged_mw.rl.run_folder import checkpoints
-from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.config import load_yaml
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
 _PATHS = [str(ROOT), str(ROOT / "tests"), *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -168,12 +168,6 @@ def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert rank_device(Rank(0, 0, 1), None) is None and rank_device(Rank(0, 0, 1), "cuda:1") == "cuda:1"
     assert rank_device(Rank(3, 1, 4), None) == "cuda:1" and rank_device(Rank(3, 1, 4), "cpu") == "cpu"
-    with pytest.raises(
-        ConfigError, match="--device cuda:0: under torchrun every process takes the GPU of its own number"
-    ):
-        rank_device(Rank(0, 0, 2), "cuda:0")
-    with pytest.raises(ConfigError, match="process 2 on a machine with 2 GPUs; use --nproc_per_node=2"):
-        rank_device(Rank(2, 2, 3), None)
 
 
 @pytest.mark.two_gpus

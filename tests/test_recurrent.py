@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from legged_mw.check.recordable import recordable
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.students.recurrent import HiddenState, SequenceInput, step, unroll
-from legged_mw.utils.config import ConfigError
 
 
 def rnn(kind: str, layers: int = 1) -> dict[str, Any]:
@@ -216,19 +215,6 @@ def test_symmetric_samples_teach_a_recurrent_policy_symmetry(coefficient: float)
 
 
 # ---- what is refused, saved and recorded
-
-
-@pytest.mark.parametrize(
-    ("settings", "text"),
-    [
-        ({"num_mini_batches": 33}, "num_mini_batches"),
-        ({"symmetry_cfg": IMAGES | {"use_data_augmentation": False, "use_mirror_loss": True}}, "use_data_augmentation"),
-        ({"symmetry_cfg": IMAGES, "optimizer": "sgd"}, "switch"),
-    ],
-)
-def test_what_does_not_go_with_a_memory(settings: dict[str, Any], text: str) -> None:
-    with pytest.raises(ConfigError, match=text):
-        make(GraphedPPO, memory=NETWORKS["actor alone"], **settings)
 
 
 @pytest.mark.parametrize(

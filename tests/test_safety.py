@@ -178,15 +178,6 @@ def test_every_allowed_class_is_one_that_rsl_rl_finds_under_that_name() -> None:
                     check_classes(task.train)
 
 
-def test_a_distribution_takes_the_fields_of_its_section() -> None:
-    """Whoever names it; rsl-rl's own error would be a TypeError of a constructor."""
-    task = load_task("go1_flat")
-    task.set("actor.distribution_cfg.class_name", "BetaDistribution")
-    text = "which takes no init_std, std_range, std_type, fields of actor.distribution_cfg; there fit: GaussianDistribution, Hetero"
-    with pytest.raises(ConfigError, match=f"^actor.distribution_cfg.class_name is 'BetaDistribution', {text}"):
-        check_classes(task.train)
-
-
 def test_a_class_of_the_right_kind_may_be_chosen(tmp_path: Path) -> None:
     """By a flag, and then by the run's own config.yaml."""
     result = run(

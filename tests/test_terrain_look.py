@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -241,12 +242,8 @@ def test_play_has_a_small_grid_with_a_robot_on_each_kind() -> None:
 
 def test_what_is_said_of_the_ground_wins_over_the_small_grid() -> None:
     stairs = (
-        "--set",
-        "terrain.terrain_proportions={stairs_up: 1}",
-        "--set",
-        "terrain.difficulty=[0.5,0.5]",
-        "--set",
-        "terrain.num_rows=1",
+        *shlex.split("--set 'terrain.terrain_proportions={stairs_up: 1}' --set 'terrain.difficulty=[0.5,0.5]'"),
+        *shlex.split("--set terrain.num_rows=1"),
     )
     out, session = played(*stairs)
     assert (

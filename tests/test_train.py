@@ -346,10 +346,7 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
         sys.executable,
         str(ROOT / "train.py"),
         *SMALL,
-        "--max_iterations",
-        "1000000",
-        "--experiment_name",
-        "my runs",
+        *shlex.split("--max_iterations 1000000 --experiment_name 'my runs'"),
     ]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None

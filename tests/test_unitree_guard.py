@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -13,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -137,20 +138,22 @@ def test_what_is_safe_may_hold_for_ever(bench: Bench) -> None:
     assert not bench.guard.tripped and bench.wire.sent[-1] == b"l" * SIZE
 
 
-def test_a_policy_that_dies_is_damped(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("happens", "text"),
+    [
+        (lambda bench: bench.here.close(), "the policy's process ended"),
+        (lambda bench: setattr(bench.wire, "other", True), "another program sends commands to this robot, too"),
+        (lambda bench: setattr(bench.wire, "robots", "two robots answer"), "two robots answer"),
+    ],
+    ids=["the policy dies", "a second commander", "another robot"],
+)
+def test_what_it_damps_for(happens: Callable[[Bench], object], text: str, bench: Bench) -> None:
     bench.send(guard.MOVE, MOVING)
     assert until(lambda: bench.wire.sent)
-    bench.here.close()
-    assert bench.ended() and bench.wire.sent[-1] == DAMPING
-    assert bench.board.get().text == "the policy's process ended; the joints are damped"
-
-
-def test_a_second_commander(bench: Bench) -> None:
-    bench.send(guard.MOVE, MOVING)
-    assert until(lambda: bench.wire.sent)
-    bench.wire.other = True
-    assert until(lambda: bench.wire.sent[-1] == DAMPING)
-    assert bench.board.get().text == "another program sends commands to this robot, too; the joints are damped"
+    happens(bench)
+    assert until(lambda: bench.wire.sent[-1] == DAMPING) and until(lambda: bench.board.get().text)
+    assert bench.board.get().text == f"{text}; the joints are damped"
+    assert bench.here.fileno() >= 0 or bench.ended()
 
 
 def test_a_guard_that_is_told_to_end_damps_first(bench: Bench) -> None:
@@ -158,14 +161,6 @@ def test_a_guard_that_is_told_to_end_damps_first(bench: Bench) -> None:
     assert until(lambda: bench.wire.sent)
     bench.guard.stop()
     assert bench.ended() and bench.wire.sent[-1] == DAMPING
-
-
-def test_another_robot(bench: Bench) -> None:
-    bench.send(guard.MOVE, MOVING)
-    assert until(lambda: bench.wire.sent)
-    bench.wire.robots = "two robots answer"
-    assert until(lambda: bench.wire.sent[-1] == DAMPING)
-    assert bench.board.get().text == "two robots answer; the joints are damped"
 
 
 def test_a_clock_that_goes_back(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -505,12 +500,7 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
     (tmp_path / "remote.yaml").write_text(f"remote: [{{time: 0, ly: 0.4}}, {', '.join(press)}]")
     command = [
         sys.executable,
-        "-m",
-        "legged_mw.deploy",
-        "go2_flat",
-        "--interface",
-        "lo",
-        "--domain",
+        *shlex.split("-m legged_mw.deploy go2_flat --interface lo --domain"),
         str(domain),
         "--serve",
         "unitree",

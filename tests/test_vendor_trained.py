@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -16,22 +17,12 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.utils.config import load_yaml
 
 FEW = [
-    "--num_envs",
-    "8",
-    "--max_iterations",
-    "3",
-    "--set",
-    "runner.num_steps_per_env=8",
-    "--set",
-    "runner.exam_interval=0",
+    *shlex.split("--num_envs 8 --max_iterations 3 --set runner.num_steps_per_env=8"),
+    *shlex.split("--set runner.exam_interval=0"),
 ]
 FEW += [
-    "--set",
-    "actor.hidden_dims=[16, 16]",
-    "--set",
-    "critic.hidden_dims=[16, 16]",
-    "--set",
-    "algorithm.num_learning_epochs=1",
+    *shlex.split("--set 'actor.hidden_dims=[16, 16]' --set 'critic.hidden_dims=[16, 16]'"),
+    *shlex.split("--set algorithm.num_learning_epochs=1"),
 ]
 FILES = {path.name for path in HERE.iterdir() if path.suffix in (".xml", ".urdf")}
 

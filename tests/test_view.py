@@ -123,33 +123,18 @@ def test_broken_run_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: s
     assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [(name, b"old")]
 
 
-def test_no_encoder_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(av, "codecs_available", {"gif"})
-        VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5).abort()
-        with pytest.raises(
-            RuntimeError, match=r"PyAV .* was built without libx264. Install another: pip install --force-reinstall av"
-        ):
-            VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50)
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(
-        RuntimeError, match=r'Videos are written by PyAV \(.*\). Install it: pip install "legged_mw\[video\]"'
-    ):
-        VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50)
+def test_a_gif_needs_no_encoder_of_mp4(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(av, "codecs_available", {"gif"})
+    VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5).abort()
 
 
 def test_bad_video_requests(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match=r"'walk.avi': the supported extensions are \.mp4 \(H.264\) and \.gif"):
-        VideoWriter(tmp_path / "walk.avi", 320, 240, fps=50)
-    with pytest.raises(RuntimeError, match="321 x 240 cannot be encoded: yuv420p needs an even width"):
-        VideoWriter(tmp_path / "walk.mp4", 321, 240, fps=50)
     with pytest.raises(ValueError, match="fps = 0"):
         VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=0)
     writer = VideoWriter(tmp_path / "empty.mp4", 320, 240, 50)
     with pytest.raises(ValueError, match=r"uint8 \(240, 320, 3\); got float64 \(2, 2, 3\)"):
         writer.add(np.zeros((2, 2, 3)))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(RuntimeError, match="empty.mp4 was not written: no frame"):
-        writer.close()
+    writer.abort()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -566,29 +551,6 @@ def test_has_display_follows_the_environment(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("DISPLAY")
     monkeypatch.setattr(sys, "platform", "darwin")
     assert has_display()
-
-
-def test_window_without_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch, model: mujoco.MjModel) -> None:
-    monkeypatch.setattr(native, "has_display", lambda: False)
-    with pytest.raises(RuntimeError, match="neither DISPLAY nor WAYLAND_DISPLAY is set.*--viewer web, record a video"):
-        NativeViewer(SPEC)
-    monkeypatch.setattr(native, "has_display", lambda: True)
-    monkeypatch.setattr(native, "_can_open_window", lambda: False)
-    monkeypatch.setenv("DISPLAY", ":99")
-    with pytest.raises(RuntimeError, match="No OpenGL window can be opened on this display .*DISPLAY=':99'"):
-        NativeViewer(SPEC)
-
-
-def test_plain_python_on_macos_is_told_of_mjpython(monkeypatch: pytest.MonkeyPatch, model: mujoco.MjModel) -> None:
-    import mujoco.viewer
-
-    def refuse(*_: object, **__: object) -> None:
-        raise RuntimeError("`launch_passive` requires mjpython")
-
-    monkeypatch.setattr(sys, "platform", "darwin")
-    monkeypatch.setattr(mujoco.viewer, "launch_passive", refuse)
-    with pytest.raises(RuntimeError, match="start with `mjpython` in place of `python`"):
-        NativeViewer(SPEC)
 
 
 @pytest.mark.display

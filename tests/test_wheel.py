@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import sysconfig
@@ -128,17 +129,8 @@ def test_an_installed_package_trains_the_task_of_the_first_page_and_logs_where_i
     home.mkdir()
     (home / "go1_gentle.py").write_text(code)
     small = [
-        "--device",
-        "cpu",
-        "--num_envs",
-        "8",
-        "--max_iterations",
-        "1",
-        "--verbose",
-        "--set",
-        "runner.num_steps_per_env=4",
-        "--set",
-        "runner.export=false",
+        *shlex.split("--device cpu --num_envs 8 --max_iterations 1 --verbose --set runner.num_steps_per_env=4"),
+        *shlex.split("--set runner.export=false"),
     ]
     out = start(installed, tmp_path, "train", "--task", str(home / "go1_gentle.py"), *small)
     assert "rew_crouch" in out and "watch it with\n  legged-mw play --task " in out

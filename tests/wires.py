@@ -9,6 +9,7 @@ import itertools
 import os
 import tempfile
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.unitree.client import Direct, UnitreeRobot
-from legged_mw.unitree.link import LEASE, RobotEnd, Wire
+from legged_mw.unitree.link import LEASE, Received, RobotEnd, Wire
 from legged_mw.unitree.robots import machine_of
 from legged_mw.unitree.serve import STEP, SimulatedUnitree
 
@@ -58,6 +59,27 @@ def domain() -> Iterator[int]:
     """Of one test."""
     with locked_domain() as number:
         yield number
+
+
+class Owner:
+    """The policy's end of a wire that leads nowhere: states that wait, and what is sent."""
+
+    def __init__(self, *bodies: bytes, stamp: float = 0.0) -> None:
+        self.states = deque(Received(body, stamp) for body in bodies)
+        self.sent = list[bytes]()
+
+    def receive(self) -> Received | None:
+        return self.states.popleft() if self.states else None
+
+    def arm(self, damping: bytes) -> None:
+        self.sent.append(damping)
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        self.sent.append(body)
+
+    def close(self, last: bytes) -> str:
+        self.sent.append(last)
+        return ""
 
 
 class Pair(NamedTuple):

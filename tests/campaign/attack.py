@@ -1,17 +1,8 @@
 """Bad inputs as tables: each ends in one line that says what is wrong, and changes nothing.
 
-To add a table, write tests/campaign/test_<cause>.py, whose name no other test file has (pytest asks for that):
+What a refusal says stands in tests/golden: add its case there. A test of more than the line calls `attack` itself:
 
-    from attack import Case, attack, program
-
-    CASES = [
-        Case("gamma above 1", program("train", "--check", "--set", "algorithm.gamma=5"), "algorithm.gamma is 5.0"),
-        Case("a half contract", lambda root: read_contract(root / "out"), ("policy.yaml", "no joints"), given=half_a_contract),
-    ]
-
-    @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
-    def test_files(case: Case, tmp_path: Path) -> None:
-        attack(case, tmp_path)
+    attack(Case("gamma above 1", program("train", "--check", "--set", "algorithm.gamma=5"), "algorithm.gamma is 5.0"), tmp_path)
 
 ``run`` is any function of the test's folder, or `program(...)`: train, play, deploy or robot with its flags, where "ROOT" stands for
 that folder; a --task that is not named is go1_flat. It runs in that folder, with its logs below. ``given`` fills the folder before.
@@ -54,13 +45,15 @@ class Case(NamedTuple):
 
     id: str
     run: Callable[[Path], object]
-    says: str | tuple[str, ...]  # what the line holds
+    says: str | tuple[str, ...] = ""  # what the line holds; tests/golden/errors.txt has that of its cases whole
     code: int = 2
     given: Callable[[Path], object] = lambda root: None
     name: str = "train.py"  # how the line begins; `program` knows it
 
 
-class _Program:
+class Program:
+    """A program and its flags; called with the test's folder it runs there."""
+
     def __init__(self, name: str, flags: tuple[str, ...]) -> None:
         self.name, self.flags = name, flags
 
@@ -79,14 +72,14 @@ class _Program:
 
 def program(name: str, *flags: str) -> Callable[[Path], object]:
     """``name`` (train, play, deploy, robot) with its flags, as a user would start it."""
-    return _Program(name, flags)
+    return Program(name, flags)
 
 
 def attack(case: Case, root: Path, allowed: tuple[Path, ...] = ()) -> str:
     """Run ``case`` in the folder ``root`` and return its line. ``allowed``: other folders that may be written to."""
     case.given(root)
     before, places = files(root), [root.resolve(), *(path.resolve() for path in allowed)]
-    name = f"{case.run.name}.py" if isinstance(case.run, _Program) else case.name
+    name = f"{case.run.name}.py" if isinstance(case.run, Program) else case.name
     with limits(), contextlib.chdir(root), stopped_at_work(), captured() as said, watched() as written:
         code = ended(case.run, root, name)
     assert code == case.code, f"exit code {code}: {said[0]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -11,11 +12,7 @@ def test_five_kills_lose_nothing() -> None:
     program = [
         sys.executable,
         str(Path(__file__).with_name("kills.py")),
-        "--kills",
-        "5",
-        "--iterations",
-        "5",
-        "--no_export",
+        *shlex.split("--kills 5 --iterations 5 --no_export"),
     ]
     done = subprocess.run(program, capture_output=True, text=True, timeout=1200)
     assert done.returncode == 0, done.stderr[-3000:]

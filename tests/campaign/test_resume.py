@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,7 @@ from legged_mw.rl.run_folder import CheckpointWriter, checkpoints
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = [
-    "--set",
-    "runner.save_interval=1",
-    "--max_iterations",
-    "3",
-    "--seed",
-    "3",
-    "--set",
-    "cpu.update_threads=1",
+    *shlex.split("--set runner.save_interval=1 --max_iterations 3 --seed 3 --set cpu.update_threads=1"),
     "--eager",
 ]
 DELAYS = ["action_delay=[0, 2]", "observation_delay=[0, 2]", "delay_ms=[0.0, 12.0]", "encoder_offset=[-0.02, 0.02]"]
@@ -31,25 +25,13 @@ TILES = ["--set", "terrain.num_rows=2", "--set", "terrain.num_cols=8"]
 TASKS = {  # what is trained -> flags; with symmetry, kicks, noise and episodes that end on the way
     "go1_rough": ["--task", "go1_rough", *TILES],
     "drawn worlds, delays, history": [
-        *(
-            "--task",
-            "go1_flat_dr",
-            "--set",
-            "domain_rand.redraw_iterations=1",
-            "--set",
-            "observations.history={state: 3}",
-        ),
+        *shlex.split("--task go1_flat_dr --set domain_rand.redraw_iterations=1"),
+        *shlex.split("--set 'observations.history={state: 3}'"),
         *(word for each in DELAYS for word in ("--set", f"domain_rand.{each}")),
     ],
     "curricula, memory": [
-        *(
-            "--set",
-            "commands.curriculum=true",
-            "--set",
-            "perturbation.curriculum=true",
-            "--set",
-            "perturbation.push=true",
-        ),
+        *shlex.split("--set commands.curriculum=true --set perturbation.curriculum=true"),
+        *shlex.split("--set perturbation.push=true"),
         *("--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=8", "--set", "cpu.rnn_hidden_dim=8"),
     ],
     "estimator": ["--task", "go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],

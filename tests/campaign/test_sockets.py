@@ -30,7 +30,7 @@ from legged_mw.unitree.serve import SimulatedUnitree
 from legged_mw.view.drive import Pilot
 from legged_mw.view.stage import Moment, ViewError
 from legged_mw.view.web import MOST, Gate, WebViewer, is_local
-from tests.wires import POLICIES
+from tests.wires import POLICIES, Owner
 
 NAN, INF = math.nan, math.inf
 udp: Any = importlib.import_module("examples.udp_robot")
@@ -414,24 +414,6 @@ class FakeEnd:
     def answer(self) -> None: ...
 
 
-class FakeOwner:
-    """The policy's end: states that wait."""
-
-    def __init__(self) -> None:
-        self.states, self.sent = deque[Received](), list[bytes]()
-
-    def receive(self) -> Received | None:
-        return self.states.popleft() if self.states else None
-
-    def arm(self, damping: bytes) -> None: ...
-
-    def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        self.sent.append(body)
-
-    def close(self, last: bytes) -> str:
-        return ""
-
-
 @pytest.fixture(scope="module")
 def state() -> bytes:
     """A state of a Go2 that stands there for a second."""
@@ -465,7 +447,7 @@ STATES = [
 @each("make, why", STATES)
 def test_the_client_of_a_robot_drops_states(make: Callable[[bytes], bytes], why: str, state: bytes) -> None:
     """However many: they are no news, so the newest good one grows old and the run ends."""
-    owner, now = FakeOwner(), [10.0]
+    owner, now = Owner(), [10.0]
     robot = UnitreeRobot(GO2, owner, Received(state, 10.0), clock=lambda: now[0])
     for step in range(5):
         now[0] = 10.0 + 0.002 * step
@@ -494,7 +476,7 @@ TRIPS = [
 
 @each("parts, says", TRIPS)
 def test_a_whole_state_that_cannot_be_ends_the_walk(parts: dict[str, Any], says: str, state: bytes) -> None:
-    owner = FakeOwner()
+    owner = Owner()
     robot = UnitreeRobot(GO2, owner, Received(state, 1.0), clock=lambda: 1.0)
     owner.states.append(Received(changed(state, tick=tick(state) + 2, **parts), 1.0))
     limits = Limits.of(

@@ -11,6 +11,7 @@ AREAS = [
     "files",
     "motions",
     "motors",
+    "outputs",
     "own_code",
     "robot_files",
     "strangers",

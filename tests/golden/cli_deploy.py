@@ -17,6 +17,8 @@ nosuch
 go1_falt
 go1_flat --eval --command=0,0,0
 go1_flat --eval --terrain
+go1_flat --eval --viewer none
+go1_flat --eval --ranges common
 go1_flat --switch fall
 go1_flat go2_flat
 go1_flat go1_flat --switch fall --eval
@@ -34,6 +36,8 @@ go1_flat --limit tilt=4
 go1_flat --limit tilt --drive
 go1_flat --limit tlit=4 --drive
 go1_flat --limit tilt=x --drive
+go1_flat --limit tilt=-1 --drive
+go1_flat --limit tilt=nan --drive
 go1_flat --drive --gamepad none
 go1_flat --drive --stop_fd 9999
 go1_flat --domain 1
@@ -48,6 +52,9 @@ go1_flat --serve unitree --velocity odometry
 go2_flat --serve unitree --robot unitree
 go2_flat --robot unitree
 go2_flat --serve unitree --interface lo --viewer web
+go2_flat --serve unitree --interface lo --num_envs 3
+go2_flat --robot unitree --interface lo --viewer video
+go2_flat --robot unitree --interface lo --fault loss=5
 go2_flat --robot unitree --interface lo --terrain
 go1_flat --robot unitree --interface lo
 go1_flat --command=9,0,0
@@ -88,6 +95,13 @@ SCRIPTS = {
     "too fast": "commands: [{time: 0, command: [9, 0, 0]}]",
     "too many": "commands: [{time: 0, command: [0, 0, 0, 0]}]",
     "words": "commands: [{time: 0, command: fast}]",
+    "too few": "commands: [{time: 0, command: [0, 0]}]",
+    "no values": "commands: [{time: 0, command: []}]",
+    "a value of NaN": "commands: [{time: 0, command: [1, 0, .nan]}]",
+    "a value of words": "commands: [{time: 0, command: {lin_vel_x: fast}}]",
+    "too slow a turn": "commands: [{time: 0, command: {ang_vel_yaw: -3}}]",
+    "a push of a number": "commands: [{time: 0, push: 3}]",
+    "half a list": "commands: [",
 }
 REMOTES = {
     "nothing": "remote: []",
@@ -98,6 +112,14 @@ REMOTES = {
     "hoist of words": "remote: [{time: 0, hoist: up}]",
 }
 FAULTS = [
+    "dealy=3",
+    "clock_jump=1e9",
+    "joint_bias=inf",
+    "low_battery=-1",
+    "frozen@soon",
+    "motor_fault",
+    "motor_fault=FL_hip",
+    "nan=z",
     "nosuch",
     "delay=10@x",
     "joint_sign",

@@ -69,6 +69,9 @@ CHECKED = [  # what shows only when robot, environment or learner is built
     *("symmetry.use_mirror_loss=true", "actor.concurrent.groups=[privileged]", "actor.concurrent.groups=[state]"),
     *(
         "actor.estimator.targets=[nosuch]",
+        "actor.estimator.targets=[state]",
+        "actor.estimator.targets=[commands]",
+        "actor.estimator.targets=[foot_height]",
         "actor.estimator.targets=[base_lin_vel, base_lin_vel]",
         "asset.foot_geoms={FX: [FR]}",
     ),
@@ -85,6 +88,10 @@ TWO = [
         "symmetry.use_mirror_loss=true",
     ],
     ["actor.estimator.targets=[base_lin_vel]", "actor.class_name=RNNModel"],
+    ["actor.concurrent.groups=[privileged_state]", "actor.class_name=RNNModel"],
+    ["actor.concurrent.groups=[privileged_state]", "algorithm.class_name=PPO"],
+    ["actor.estimator.targets=[base_lin_vel]", "actor.class_name=CNNModel"],
+    ["actor.estimator.targets=[base_lin_vel]", "algorithm.optimizer=sgd"],
     ["actor.estimator.targets=[base_lin_vel]", "actor.concurrent.groups=[privileged_state]"],
     ["control.actuator=network", "control.network=none.npz"],
     ["control.actuator=dc_motor", "control.stall_torque={}"],
@@ -156,7 +163,14 @@ PLAY = [
     ),
     *(
         line.split()
-        for line in ("--half", "--eval --viewer web", "--export", "--load_run nosuch", "--load_run shipped")
+        for line in (
+            "--viewer none --sheet a.png",
+            "--half",
+            "--eval --viewer web",
+            "--export",
+            "--load_run nosuch",
+            "--load_run shipped",
+        )
     ),
     *(line.split() for line in ("--experiment_name elsewhere --load_run -1", "--load_run run --checkpoint 7")),
     ["--video", ""],

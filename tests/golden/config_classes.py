@@ -52,7 +52,7 @@ VALUES = {  # path -> values of a wrong type
     "commands.ranges.lin_vel_x": [[0.0, "1"], "[1, a]", "[1, 2"],
     "commands.ranges.path": [[1, 2.5]],
     "rewards.scales.torques": ["big"],
-    "rewards.scales.brand_new": [True, None],
+    "rewards.scales.brand_new": [True, None, "abc", "1x"],
 }
 PATHS = [
     "env.num_env",

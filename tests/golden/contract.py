@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import zipfile
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,21 @@ CHANGES: dict[str, Any] = {
     "a section of text": set_at("robot", "go1"),
     "another law": set_at("motors", {"law": "magic"}),
     "a task of numbers": set_at("task", 3),
+    "a joint for another": set_at("joints|4", "FL_hip_joint"),
+    "a joint less everywhere": lambda said: (
+        pops("joints", "default_pose", "stiffness", "damping")(said),
+        [said["action"][end].pop() for end in ("lowest", "highest")],
+    ),
+    "no lowest target": drops("action|lowest"),
+    "a highest target below": set_at("action|highest|0", -1.0),
+    "no digest of the scene": drops("physics|sha256"),
+    "a scale less": set_at("action|scale", [0.5] * 11),
+    "no origin": drops("action|origin"),
+    "a command less": pops("commands"),
+    "a clip of NaN": set_at("action|clip", float("nan")),
+    "a period of its own": set_at("period", 0.03),
+    "an exam of a number": set_at("exam", 3),
+    "rows in a mapping": set_at("observation", {}),
 }
 SCENES: dict[str, Any] = {  # what the contract says, that scene.xml does not
     "another joint": set_at("joints|4", "FL_thihg_joint"),
@@ -78,11 +94,21 @@ SCENES: dict[str, Any] = {  # what the contract says, that scene.xml does not
     "no sensor of falls": set_at("ends|falls_on", ["trunk_box"]),
     "another sensor": lambda said: said["sensors"]["joint_pos"].__setitem__(0, "FR_hip_jont"),
     "a sensor less": lambda said: said["sensors"]["joint_pos"].pop(),
+    "another highest target": set_at("action|highest|0", 0.5),
+    "another gyro": set_at("sensors|ang_vel", ["gyro/imuu"]),
+    "two sensors for one": set_at("sensors|ang_vel", ["gyro/imu", "up/imu"]),
+    "no sensors of speeds": drops("sensors|joint_vel"),
     "sensors in another order": lambda said: said["sensors"]["joint_pos"].reverse(),
+}
+SCANS: dict[str, Any] = {  # of go1_rough_scan
+    "no section of it": drops("height_scan"),
+    "no points ahead": drops("height_scan|x"),
+    "a point less": lambda said: said["height_scan"]["y"].pop(),
 }
 NETWORKS: dict[str, Any] = {
     "a row less": pops("observation"),
     "a history more": set_at("observation|3|history", 3),
+    "another input": set_at("network|input", "observations"),
     "a memory more": set_at("network|memory", {"input": "state_in", "output": "state_out", "shape": [1, 8]}),
 }
 EXAMS: dict[str, Any] = {
@@ -93,9 +119,16 @@ EXAMS: dict[str, Any] = {
     "two marks": set_at("exam", {"marks": [1.0, 2.0]}),
     "another robot": set_at("exam", {"peer": "dog"}),
     "no such field": set_at("exam", {"pushes": 3}),
+    "speeds of a number": set_at("exam", {"push_speeds": 3}),
 }
+FAR = '<asset><mesh name="z" file="..&#47;x.obj"/></asset>'
 IN_SCENE = {
     "another name of a joint": ('name="FR_hip_joint"', 'name="FR_hip"'),
+    "a file elsewhere": ("</worldbody>", f"</worldbody>{FAR}"),
+    "a file between comments": (
+        "</worldbody>",
+        f'</worldbody><custom><text name="<!--" data="a"/></custom>{FAR}<custom><text name="-->" data="a"/></custom>',
+    ),
 }
 
 
@@ -108,6 +141,15 @@ def theirs(name: str, change: Any = lambda said: None, folder: str = "out") -> R
         save_yaml(root / folder / "policy.yaml", said | {CHECKSUM: checksum(said)})
 
     return given
+
+
+def damaged(root: Path, content: bytes | None) -> None:
+    """A network that was broken before its contract was signed; by half if nothing is said."""
+    file = POLICIES / "go1_flat/policy.onnx"
+    whole = file.read_bytes()
+    content = whole[: len(whole) // 2] if content is None else content
+    theirs("go1_flat", set_at("network|sha256", sha256(content).hexdigest()))(root)
+    (root / "out/policy.onnx").write_bytes(content)
 
 
 def zipped(file: Path, *names: str) -> None:
@@ -123,6 +165,11 @@ def reads(root: Path) -> None:
 def in_scene_too(root: Path) -> None:
     """As by --edited: the scene's checksum would answer first."""
     read_scene(root / "out", read_contract(root / "out", edited=True))
+
+
+def in_limits_too(root: Path) -> None:
+    """Whoever reads the scene refuses it, also for the limits of a real robot."""
+    Limits.of(root / "out", read_contract(root / "out", edited=True))
 
 
 def rules(root: Path) -> None:
@@ -144,12 +191,15 @@ def table() -> Table:
         made.add(f"contract, {name}", reads, says_else(change, stamped))
     for name, change in CHANGES.items():
         made.add(f"contract: {name}", reads, theirs("go1_flat", change))
+    for name, change in SCANS.items():
+        made.add(f"scan: {name}", reads, theirs("go1_rough_scan", change))
     for name, old, new, *_ in campaign.SCENES:
         made.add(f"scene, {name}", in_scene_too, in_scene(old, new))
     for name, change in SCENES.items():
         made.add(f"scene: {name}", in_scene_too, theirs("go1_flat", change))
     for name, (old, new) in IN_SCENE.items():
         made.add(f"scene: {name}", in_scene_too, in_scene(old, new))
+        made.add(f"limits by a scene: {name}", in_limits_too, in_scene(old, new))
     for name, change in NETWORKS.items():
         made.add(
             f"network: {name}",
@@ -171,6 +221,19 @@ def table() -> Table:
             theirs("go1_handstand", set_at("exam", section)),
         )
     made.add("no export", reads)
+    for file in ("policy.onnx", "scene.xml"):
+        made.programs(
+            "deploy",
+            ["out"],
+            lambda root, file=file: (theirs("go1_flat")(root), (root / "out" / file).unlink()),
+            name=f"no {file}",
+        )
+    for name, content in {"empty": b"", "of text": b"not a network\n", "half": None}.items():
+        made.add(
+            f"network {name}",
+            lambda root: Network(root / "out", read_contract(root / "out")),
+            lambda root, content=content: damaged(root, content),
+        )
     made.add("another scene", reads, in_scene("<mujoco", "<!-- mine --><mujoco"))
     made.add(
         "another network", reads, lambda root: (theirs("go1_flat")(root), (root / "out/policy.onnx").write_bytes(b"no"))
@@ -191,11 +254,21 @@ def table() -> Table:
         theirs("go1_flat"),
     )
     made.add(
+        "a terrain that is gone",
+        lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"),
+        lambda root: (theirs("go1_rough")(root), (root / "out/terrain.mjz").unlink()),
+    )
+    made.add(
         "no feet for odometry",
         lambda root: Odometry(root / "out", read_contract(root / "out")),
         theirs("go1_flat", set_at("robot|feet", {})),
     )
     made.add("a limit that is none", lambda root: limits(root), theirs("go1_flat", set_at("safety", {"tlit": 3})))
+    made.add(
+        "a machine's limit that is none",
+        lambda root: Limits.of(root / "out", read_contract(root / "out"), {"tlit": 3}),
+        theirs("go1_flat"),
+    )
     made.add("a limit of words", lambda root: limits(root, tilt="x"), theirs("go1_flat"))
     made.add(
         "a policy of speeds",

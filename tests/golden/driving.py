@@ -33,6 +33,7 @@ from legged_mw.unitree.client import Direct, UnitreeRobot, check_rows
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.robots import G1, GO2, check_body, machine_of
+from tests.wires import Owner
 
 GO2_FLAT = ROOT / "resources/policies/go2_flat"
 CONTRACT = read_contract(GO2_FLAT)
@@ -40,20 +41,6 @@ STATE = LAYOUTS["unitree_go", "LowState_"]
 
 
 # ---- the wire
-
-
-class Owner:
-    """A wire that gives the messages it is told to."""
-
-    def __init__(self) -> None:
-        self.bodies: list[bytes] = []
-
-    def receive(self) -> Any:
-        return Received(self.bodies.pop(0), 0.0) if self.bodies else None
-
-    def arm(self, damping: bytes) -> None: ...
-
-    def send(self, body: bytes, stamp: float, safe: bool) -> None: ...
 
 
 def state(**parts: Any) -> WireMessage:
@@ -74,7 +61,7 @@ def after(*bodies: bytes, late: float = 0.0) -> None:
     """Read after these states came, the last of them ``late`` s ago."""
     now = [0.0]
     made = robot(clock=lambda: now[0])
-    made._owner.bodies += bodies  # type: ignore[attr-defined]
+    made._owner.states.extend(Received(body, 0.0) for body in bodies)  # type: ignore[attr-defined]
     now[0] = late
     for _ in bodies or [b""]:
         made.read()
@@ -87,9 +74,7 @@ def another_body() -> None:
         message = WireMessage(LAYOUTS["unitree_hg", "LowState_"])
         message["mode_machine"] = number
         bodies.append(message.seal())
-    made = UnitreeRobot(contract, owner := Owner(), Received(bodies[0], 0.0), clock=lambda: 0.0)
-    owner.bodies.append(bodies[1])
-    made.read()
+    UnitreeRobot(contract, Owner(bodies[1]), Received(bodies[0], 0.0), clock=lambda: 0.0).read()
 
 
 def other_rows(machine: Any, *rows: str) -> None:

@@ -30,6 +30,11 @@ def clip() -> Clip:
     return Clip(30.0, ("knee",), np.zeros((31, 3)), rest, np.zeros((31, 1)))
 
 
+def cut(root: Path) -> None:
+    save_clip(root / "a.npz", clip())
+    (root / "a.npz").write_bytes((root / "a.npz").read_bytes()[:500])
+
+
 CLIPS: dict[str, Any] = {
     "another joint": lambda: clip()._replace(joint_names=("ankle",)),
     "a long quaternion": lambda: clip()._replace(root_quat=2 * clip().root_quat),
@@ -66,6 +71,7 @@ def table() -> Table:
         "nothing": lambda root: (root / "a.npz").touch(),
         "one array": lambda root: (np.save(root / "a.npy", np.zeros(3)), (root / "a.npy").rename(root / "a.npz")),
         "no file": lambda root: None,
+        "half": cut,
     }.items():
         made.add(f"clip, {name}", lambda root: read_clip(Path("a.npz")), given)
         made.add(f"motion, {name}", lambda root: read_motion(Path("a.npz"), g1()), given)

@@ -27,6 +27,7 @@ CHOICES: dict[str, dict[str, Any]] = {  # of the Go1
     "gains of hips alone": {"stiffness": {"hip": 1.0, "thigh": 2.0}},
     "no gains": {"damping": {}},
     "gains of another joint": {"damping": {"joint": 35.0, "FR_hip_joitn": 20.0}},
+    "gains of another joint and none of a third": {"damping": {"hip": 1.0, "tihgh": 2.0}},
     "another collider": {"colliders": ["FR", "FL", "RR", "RLL"]},
     "another pattern": {"colliders": ["foot_*"]},
     "another foot": {"contact_geoms": ["FR", "FL", "RR", "RLL"]},

@@ -7,10 +7,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import test_biped
 import test_teacher
 import torch
+from test_biped import ON
+from test_estimator import BLIND
 from test_symmetry import _Extra
-from test_teacher import CHANGES
+from test_teacher import CHANGES, SCAN
 from test_tracking import make as tracking
 from worlds import QUIET, make_env, only_scales
 
@@ -30,6 +33,7 @@ from legged_mw.utils.commands import Command
 from legged_mw.utils.task import LoadedTask, Task, load_task
 from legged_mw.view.drive import parse_command
 
+BIPED = str(ROOT / test_biped.BIPED)
 FIELDS: dict[str, dict[str, Any]] = {
     "no row of a group left": {
         "observations.leave_out": {
@@ -58,12 +62,38 @@ FIELDS: dict[str, dict[str, Any]] = {
     "no highest speed": {"asset.joint_speed_limits": {}, **only_scales(dof_vel_limits=-1.0)},
     "no gait for a term": only_scales(feet_gait=1.0),
     "another value to sense": {"asset.sense": ["forces"]},
+    "a flight of four feet": only_scales(no_fly=1.0),
+    "a stance of four feet": only_scales(single_stance=1.0),
+    "pushes of itself that cannot be": only_scales(self_collision=-1.0),
+    "an end by what never touches": {
+        "asset.terminate_after_contacts_on": ["trunk_box"],
+        "asset.colliders": ["FR", "FL", "RR", "RL"],
+    },
+    "tiles of half a cell": {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},
+    **{
+        f"a factor of {factor} on {field}": {
+            "domain_rand.enable": True,
+            "domain_rand.model_factors": {field: [factor, factor]},
+        }
+        for field in ("nosuch", "opt")
+        for factor in (1.0, 2.0)
+    },
 }
+BIPEDS: dict[str, dict[str, Any]] = {
+    "no clock for phases": {"gait.period": 0.0, "rewards.scales.contact_phase": 0.0},
+    "no clock for contacts": {"gait.period": 0.0, "rewards.scales.feet_phase": 0.0},
+    "no height": {"rewards.base_height_target": 0.0},
+    "no hips": {"rewards.hip_joints": []},
+    "other hips": {"rewards.hip_joints": ["hipp"]},
+    "one offset": {"gait.offsets": [0.0]},
+}
+ONE_FOOT = {"asset.foot_names": ["left"], "asset.foot_geoms": {"left": ["left_heel"]}}
 TRACKING: dict[str, dict[str, Any]] = {
     "no clip": {"motion.clips": []},
     "another clip": {"motion.clips": ["g1_kik.npz"]},
     "another anchor": {"motion.anchor": "torso"},
     "another end": {"motion.end_bodies": ["head"]},
+    "a start that a clip does not read": {"init_state.yaw_range": 0.0, "init_state.dof_vel_range": 0.1},
 }
 LEARNERS: dict[str, dict[str, Any]] = {
     "symmetry.mirror_loss_coeff": {"symmetry.mirror_loss_coeff": 0.0, "symmetry.use_mirror_loss": True},
@@ -140,6 +170,14 @@ def table() -> Table:
     made = Table()
     for name, fields in FIELDS.items():
         made.add(f"go1_flat with {name}", lambda root, fields=fields: make_env(1, fields))
+    for name, fields in BIPEDS.items():
+        made.add(
+            f"toy_biped with {name}", lambda root, fields=fields: make_env(1, {**QUIET, **ON, **fields}, task=BIPED)
+        )
+    made.add(
+        "toy_biped with one foot",
+        lambda root: make_env(1, {**QUIET, "rewards.scales.feet_distance": 1.0, **ONE_FOOT}, task=BIPED),
+    )
     for name, fields in TRACKING.items():
         made.add(f"g1_track with {name}", lambda root, fields=fields: tracking(worlds=1, **fields))
     for name in ("contact_forces", "self_contacts", "angular_momentum"):
@@ -204,6 +242,10 @@ def table() -> Table:
             "a bound without a record": lambda: learner(
                 {"algorithm.max_learning_rate": 0.02, "algorithm.optimizer": "sgd"}
             ),
+            "an estimate of what the actor reads": lambda: learner({**BLIND, "obs_groups.actor": ["privileged_state"]}),
+            "a memory and an optimizer that is not recorded": lambda: learner(
+                {"actor.class_name": "RNNModel", "algorithm.optimizer": "sgd", "algorithm.num_mini_batches": 1}
+            ),
             "a memory and a loss of mirrors": lambda: learner(
                 {
                     "actor.class_name": "RNNModel",
@@ -220,6 +262,15 @@ def table() -> Table:
             "a rank without a GPU": lambda: rank_device(Rank(1, 1, 2), None),
             "a config that is no walker's": lambda: LeggedRobot(load_task("go1_handstand").cfg, "cpu"),  # type: ignore[arg-type]
             "no exam": lambda: require_exam(exam("")),
+            "a command's range backwards": lambda: more_commands(height=[0.3, 0.2]).cfg.check(),
+            "another robot's teacher": lambda: test_teacher.seated(env(), load_task("g1_flat")),
+            "a teacher of another rate and scale": lambda: test_teacher.seated(
+                env(), set_all(load_task("go1_flat"), {"control.action_scale": 0.3, "sim.dt": 0.005})
+            ),
+            "a teacher's scan of other points": lambda: test_teacher.seated(
+                make_env(2, {**SCAN, "terrain.height_scan": ["privileged_state"]}),
+                set_all(load_task("go1_flat"), {**SCAN, "terrain.measured_points_x": [0.0, 0.2]}),
+            ),
         }
     )
     for name, (task, fields) in {
