@@ -17,7 +17,7 @@ try:
 except ImportError:  # Windows: no locks
     fcntl = None
 
-from legged_mw.rl.checkpoint import save_whole, suffix_of, worlds_file
+from legged_mw.rl.checkpoint import save_whole
 from legged_mw.rl.ranks import Rank
 from legged_mw.rl.saved_config import of_project, somebodys
 from legged_mw.utils.config import ConfigError, load_yaml
@@ -255,3 +255,13 @@ def _lives(process: int) -> bool:
     except OSError:  # it is another user's
         return True
     return True
+
+
+def worlds_file(checkpoint: Path, rank: Rank) -> Path:
+    """The file of the worlds of ``rank`` beside ``checkpoint``."""
+    return checkpoint.with_name(f"worlds_{checkpoint.stem.removeprefix('model_')}{suffix_of(rank)}.pt")
+
+
+def suffix_of(rank: Rank) -> str:
+    """The part of a file's name that is the rank's own; '' for a single process."""
+    return f"_{rank.index}of{rank.count}" if rank.count > 1 else ""
