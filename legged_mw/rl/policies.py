@@ -174,7 +174,7 @@ def actor_in(content: dict[str, Any], path: Path, model: MLPModel, what: str = "
     """The parameters of ``model`` in the ``content`` of the checkpoint at ``path``. Raises ConfigError."""
     own = model.state_dict()
     saved = content["student_state_dict" if "student_state_dict" in content else "actor_state_dict"]
-    saved = {name: value for name, value in saved.items() if name in own or not f"{name}".startswith(LEARNING_ONLY)}
+    saved = {name: value for name, value in saved.items() if name in own or not name.startswith(LEARNING_ONLY)}
     check_fit(saved, own, path, what)
     return saved
 
