@@ -19,8 +19,7 @@ from legged_mw.eval import perform, rollout, rough
 from legged_mw.eval.exams import require_exam
 from legged_mw.eval.walking import in_common
 from legged_mw.rl.policies import load_policy
-from legged_mw.rl.run_folder import CONFIG_FILE, checkpoints, task_of
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import CONFIG_FILE, checkpoints, task_of, update_from_run
 from legged_mw.utils.cli import pick_device, seed_everything
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task

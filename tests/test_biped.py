@@ -26,7 +26,7 @@ from legged_mw.envs.feet import GaitClock
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export import exporter as exporting
 from legged_mw.export.exporter import ExportError, export
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.task import load_task
 

@@ -34,7 +34,7 @@ from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rollout, walking
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task

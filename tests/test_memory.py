@@ -138,7 +138,7 @@ def test_the_documented_task_trains_resumes_and_exports(tmp_path: Path) -> None:
     assert run("play", tmp_path, *play, "--export", str(tmp_path / "again")).code == 0
     assert (tmp_path / "again/policy.onnx").read_bytes() == (folder / "policy.onnx").read_bytes()
     line = refused(tmp_path, "play", *play, "--set", "actor.class_name=MLPModel")
-    assert "policy.onnx does not fit this task: the actor has a memory (RNNModel) there and none here" in line
+    assert "policy.onnx does not fit this task: actor rnn.rnn.weight_ih_l0 is (24, 48) there and missing here" in line
 
 
 # ---- config

@@ -13,8 +13,7 @@ from program import SMALL, refused, run
 from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
-from legged_mw.rl.run_folder import task_of
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import task_of, update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.files import find_file

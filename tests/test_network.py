@@ -22,7 +22,7 @@ from legged_mw.export.exporter import Exported, export
 from legged_mw.export.network import run_onnx, save_onnx
 from legged_mw.rl import policies
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 

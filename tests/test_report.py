@@ -21,7 +21,7 @@ from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Case, Push, make_plan, roll_out
 from legged_mw.eval.walking import PEERS, ExamRules, in_common
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 

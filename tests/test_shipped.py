@@ -23,7 +23,7 @@ from legged_mw.eval import rollout, walking
 from legged_mw.export.exporter import FILES
 from legged_mw.export.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.files import digest
 from legged_mw.utils.task import LoadedTask, load_task

@@ -20,7 +20,7 @@ from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.rl.rsl_rl_settings import mirror, rsl_rl_config
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml

@@ -22,8 +22,8 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.policies import PolicySource, Trained, find_trained, load_policy
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
     TEACHER,
     attach_teacher_observations,

@@ -5,11 +5,16 @@ The list has the tensors that the task registered by ``buffer`` and ``remember``
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.simulation import CONSTANTS_READ
+
+MOST = 1e10  # a state beyond it has blown up for MuJoCo: mjMAXVAL
+_FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections of the config that a resumed run may change
 
 
 def memory(env: RobotTask) -> dict[str, Tensor]:
@@ -44,3 +49,45 @@ def put_snapshot(env: RobotTask, state: dict[str, Tensor]) -> str:
 
 def _words(value: Tensor | None) -> str:
     return "missing" if value is None else f"{value.dtype} {(*value.shape,)}".removeprefix("torch.")
+
+
+def same_worlds(env: RobotTask) -> dict[str, Any]:
+    """Engine, device and config that must be equal for worlds to go on exactly."""
+    config = {name: section for name, section in env.cfg.to_dict().items() if name not in _FREE}
+    return {"engine": env.sim.engine, "device": str(env.device).partition(":")[0], "config": config}
+
+
+def first_difference(there: Any, here: Any, path: str = "") -> str:
+    """``path was A and is B`` of the first value that differs; or ''."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for name in [*here, *(name for name in there if name not in here)]:
+            inner = f"{path}.{name}" if path else str(name)
+            if text := first_difference(there.get(name), here.get(name), inner):
+                return text
+        return ""
+    return "" if there == here else f"{path.removeprefix('config.')} was {there} and is {here}"
+
+
+def beyond(saved: dict[str, Tensor], own: dict[str, Tensor]) -> str:
+    """The first name with a number that is not finite or above ``MOST`` in ``saved``, but not in ``own``; or ''."""
+    return next((name for name, value in saved.items() if name in own and _sane(own[name]) and not _sane(value)), "")
+
+
+def _sane(value: Tensor) -> bool:
+    return not value.is_floating_point() or bool((value.abs() <= MOST).all())
+
+
+def random_state(device: str) -> dict[str, Tensor]:
+    """States of torch's generators of host and device."""
+    state = {"cpu": torch.get_rng_state()}
+    if device.startswith("cuda"):
+        state["cuda"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def set_random_state(state: dict[str, Tensor], device: str) -> None:
+    """Restore the generators that ``random_state`` saved."""
+    if "cpu" in state:
+        torch.set_rng_state(state["cpu"].cpu())
+    if "cuda" in state and device.startswith("cuda"):
+        torch.cuda.set_rng_state(state["cuda"].cpu(), device)

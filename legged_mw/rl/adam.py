@@ -1,4 +1,8 @@
-"""Adam that a CUDA graph can record, with all parameters in one tensor, and its state in rsl-rl's form."""
+"""Adam that a CUDA graph can record, with all parameters in one tensor, and its state in rsl-rl's form.
+
+A CPU runs its formulas as they stand here. On a GPU two kernels compute them (fast/kernels.py), and tests hold the
+kernels to the formulas, and the formulas to torch's own Adam.
+"""
 
 from __future__ import annotations
 

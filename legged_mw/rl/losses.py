@@ -1,6 +1,7 @@
-"""PPO's losses for a Gaussian policy, and their gradients with respect to the networks' outputs, in closed form.
+"""PPO's losses for a Gaussian policy, as in rsl-rl, and their gradients with respect to the networks' outputs.
 
-They are autograd's values. On a GPU each is one kernel, not fifty. Tensors are of B samples; mirror images come last.
+The formulas stand here once, and autograd differentiates them. On a GPU a kernel computes each with its gradient
+(fast/kernels.py), and tests hold the kernels to the formulas. Tensors are of B samples; mirror images come last.
 """
 
 from __future__ import annotations
@@ -59,20 +60,19 @@ def policy_loss(
         kernels.launch(kernels.policy_sums, 1, sum_rows(terms), std, entropy_coef, rows, len(old[0]), of_std, parts)
         return PolicyLoss(of_mean, of_std, *parts.unbind())
     size, advantages, (old_mean, old_std) = len(old[0]), batch.advantages, old
-    z = (batch.actions - mean) / std  # type: ignore[operator]
-    log_prob = -(0.5 * z.square() + std.log() + _HALF_LOG_2PI).sum(dim=1, keepdim=True)
-    ratio = torch.exp(log_prob - batch.old_actions_log_prob)  # type: ignore[operator]
-    plain, clipped = -advantages * ratio, -advantages * ratio.clamp(1.0 - clip, 1.0 + clip)  # type: ignore[operator]
-    weight = torch.where(plain < clipped, 0.0, plain) / len(mean)  # a clipped ratio has no gradient
-    of_mean, of_std = weight * z / std, weight * (z.square() - 1.0) / std
-    own = std[:size] if std.dim() == 2 else std.expand(size, -1)
-    of_std[:size] -= entropy_coef / size / own
-    entropy = (own.log() + (0.5 + _HALF_LOG_2PI)).sum() / size
+    with torch.enable_grad():
+        mean, std = mean.detach().requires_grad_(), std.detach().requires_grad_()
+        z = (batch.actions - mean) / std  # type: ignore[operator]
+        log_prob = -(0.5 * z.square() + std.log() + _HALF_LOG_2PI).sum(dim=-1, keepdim=True)
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob)  # type: ignore[operator]
+        clipped_ratio = ratio.clamp(1.0 - clip, 1.0 + clip)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()  # type: ignore[operator]
+        own = std[:size] if std.dim() == 2 else std
+        entropy = (own.log() + 0.5 + _HALF_LOG_2PI).sum(dim=-1).mean()
+        of_mean, of_std = torch.autograd.grad(surrogate - entropy_coef * entropy, (mean, std))
     ratio_of_std, moved = old_std / own, (old_mean - mean[:size]) / own
-    kl = (0.5 * (ratio_of_std.square() + moved.square() - 1.0) - ratio_of_std.log()).sum() / size
-    return PolicyLoss(
-        of_mean, of_std if std.dim() == 2 else sum_rows(of_std), torch.max(plain, clipped).mean(), entropy, kl
-    )
+    kl = (0.5 * (ratio_of_std.square() + moved.square() - 1.0) - ratio_of_std.log()).sum(dim=-1).mean()
+    return PolicyLoss(of_mean, of_std, surrogate.detach(), entropy.detach(), kl)
 
 
 @torch.no_grad()
@@ -84,11 +84,12 @@ def value_loss(values: Tensor, batch: RolloutStorage.Batch, clip: float, coef: f
             kernels.value_loss, len(values), values, batch.values, batch.returns, clip, coef, of_values, terms
         )
         return of_values, terms.mean()
-    error = values - batch.returns  # type: ignore[operator]
-    slope, terms = 2.0 * error, error.square()
-    if clip:
-        moved = values - batch.values  # type: ignore[operator]
-        near = (batch.values + moved.clamp(-clip, clip) - batch.returns).square()  # type: ignore[operator]
-        slope = torch.where((near > terms) & (moved.abs() > clip), 0.0, slope)
-        terms = torch.max(near, terms)
-    return coef / len(values) * slope, terms.mean()
+    with torch.enable_grad():
+        values = values.detach().requires_grad_()
+        losses = (values - batch.returns).square()  # type: ignore[operator]
+        if clip:
+            near = batch.values + (values - batch.values).clamp(-clip, clip)  # type: ignore[operator]
+            losses = torch.max(losses, (near - batch.returns).square())  # type: ignore[operator]
+        loss = losses.mean()
+        (of_values,) = torch.autograd.grad(coef * loss, values)
+    return of_values, loss.detach()

@@ -17,8 +17,15 @@ from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.checkpoint import check_fit, load_tensors
 from legged_mw.rl.rsl_rl_settings import actor_settings, check_classes, check_room, network_section
-from legged_mw.rl.run_folder import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, runs, task_of
-from legged_mw.rl.saved_config import update_from_run
+from legged_mw.rl.run_folder import (
+    CONFIG_FILE,
+    experiment_folder,
+    find_checkpoint,
+    find_run,
+    runs,
+    task_of,
+    update_from_run,
+)
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import printable, shown
 from legged_mw.utils.files import check_folder, finish_moving, typed

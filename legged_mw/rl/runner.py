@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Self
@@ -20,17 +19,19 @@ from torch import Tensor, nn
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.statistics import DivergenceStop
-from legged_mw.rl.checkpoint import (
-    check_fit,
-    check_resume,
-    load_tensors,
+from legged_mw.envs.snapshot import (
+    MOST,
+    beyond,
+    first_difference,
+    memory,
+    put_snapshot,
     random_state,
-    save_whole,
+    same_worlds,
     set_random_state,
-    take_worlds,
-    worlds_content,
+    take_snapshot,
 )
+from legged_mw.envs.statistics import DivergenceStop
+from legged_mw.rl.checkpoint import check_fit, check_resume, load_tensors, save_whole, unpack
 from legged_mw.rl.iteration_log import (
     Clock,
     Console,
@@ -47,7 +48,7 @@ from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO, RegressingModel, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
 from legged_mw.rl.rsl_rl_settings import rsl_rl_config
-from legged_mw.rl.run_folder import CheckpointWriter, reason_of
+from legged_mw.rl.run_folder import CheckpointWriter, reason_of, worlds_file
 from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
@@ -367,7 +368,7 @@ class Runner(OnPolicyRunner):
             return
         if not self.writer:
             return
-        if self.writer.write(done, self._content, partial(worlds_content, self)):
+        if self.writer.write(done, self._content, self._worlds):
             self.logger.save_model(str(self.writer.written), done)
         if self._curves_lost or self.writer.moved:
             self._curves_lost = False
@@ -396,10 +397,11 @@ class Runner(OnPolicyRunner):
         content = load_tensors(Path(path), map_location or self.device)
         (first, actor), (second, other) = self._networks().items()
         check_fit(content.get(f"{first}_state_dict", {}), actor.state_dict(), Path(path), first)
-        if not {f"{second}_state_dict", "optimizer_state_dict"} <= content.keys():
-            raise ConfigError(f"{path} holds an actor only; it can be played, but not resumed")
+        for name in (f"{second}_state_dict", "optimizer_state_dict", "iter"):
+            if name not in content:
+                raise ConfigError(f"{path} holds no {name}; it can be played, but not resumed")
         check_fit(content[f"{second}_state_dict"], other.state_dict(), Path(path), second)
-        check_resume(content, Path(path), self.alg.optimizer, self.env.training_state())
+        check_resume(content, Path(path), self._content(), self.alg.optimizer)
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
         if isinstance(self.alg, GraphedPPO):  # as in the last update, so that `_anneal` sees the end of a warm-up
@@ -414,7 +416,7 @@ class Runner(OnPolicyRunner):
         self.total_steps, self.schedule = infos.get("total_steps", 0), TrainingSchedule(used=infos.get("seconds", 0.0))
         self.env.load_training_state(infos.get("env", {}))  # before the random state: it resets worlds
         random = infos.get("random_state", {})
-        self.why_not_exact = first_word(take_worlds(self, Path(path), this_rank(), random))
+        self.why_not_exact = first_word(self._restore_worlds(Path(path), random))
         if self.why_not_exact and self.env.cfg.domain_rand.redraw_iterations:
             self.env.domain_rand.redraw()  # the seed's own draws were those of the first iterations
         if self.gpu_global_rank == 0:
@@ -422,6 +424,54 @@ class Runner(OnPolicyRunner):
         elif self.why_not_exact:  # the checkpoint holds the first rank's state; the others must draw other numbers
             torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
+
+    # The worlds have a file of their own beside the checkpoint, as it is large and not needed to play a policy. It is
+    # written before its checkpoint, and the file of the checkpoint before is deleted after, so that a kill at any
+    # moment leaves the newest checkpoint with its worlds.
+
+    def _worlds(self) -> dict[str, Any]:
+        """The content of the file of worlds: tensors and plain numbers only."""
+        return {
+            **same_worlds(self.env),
+            "random_state": random_state(self.device),
+            "worlds": take_snapshot(self.env),
+            "memories": {name: state.cpu().clone() for name, state in self._memories().items()},
+        }
+
+    def _restore_worlds(self, checkpoint: Path, random: dict[str, Tensor]) -> str:
+        """Restore worlds and memories of ``checkpoint``, whose generators are ``random``; returns why not, or ''."""
+        rank, here, own = this_rank(), same_worlds(self.env), self._memories()
+        file = worlds_file(checkpoint, rank)
+        if not file.is_file():
+            return f"there is no {file.name} beside it"
+        try:
+            content = unpack(file.read_bytes(), "cpu")
+            there = {key: content[key] for key in here}
+            state, worlds, memories = (dict(content[key]) for key in ("random_state", "worlds", "memories"))
+        except Exception as error:  # of any kind: it may hold anything
+            return f"{file.name} cannot be read: {' '.join(f'{error}'.split())}"
+        same = state.keys() == random.keys() and all(torch.equal(state[key], random[key].cpu()) for key in state)
+        if rank.leads and not same:
+            return f"{file.name} is of another checkpoint"
+        if different := first_difference(there, here):
+            return different
+        if own.keys() != memories.keys() or any(own[key].shape != memories[key].shape for key in own):
+            return "the networks' memories are of another shape"
+        if name := beyond(worlds, memory(self.env)) or beyond(memories, own):
+            return f"{file.name}: {name} is not finite, or beyond {MOST:.0e}"
+        if reason := put_snapshot(self.env, worlds):
+            return reason
+        with torch.inference_mode():
+            for key, value in memories.items():
+                own[key].copy_(value)
+        if not rank.leads:
+            set_random_state(state, self.device)
+        return ""
+
+    def _memories(self) -> dict[str, Tensor]:
+        """Hidden states of the recurrent networks, by number."""
+        states: dict[Any, Any] = getattr(self.alg, "_memories", {})
+        return {str(i): state.now for i, state in enumerate(states.values())}
 
 
 def make_runner(

@@ -36,9 +36,9 @@ from legged_mw.rl.run_folder import (
     find_run,
     new_run,
     reason_of,
+    update_from_run,
 )
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.saved_config import update_from_run
 from legged_mw.rl.transfer import (
     TEACHER,
     attach_teacher_observations,

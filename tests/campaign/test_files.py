@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,11 @@ def set_at(path: str, value: Any) -> Change:
 
 
 def drop(path: str) -> Change:
-    return lambda content: content.pop(path)
+    """Remove what is at a dotted path."""
+    *places, last = path.split("|")
+    return lambda content: reduce(
+        lambda at, place: at[int(place) if place.isdecimal() else place], places, content
+    ).pop(last)
 
 
 def poisoned(tensor: torch.Tensor, value: float = torch.nan) -> torch.Tensor:
@@ -83,108 +87,59 @@ def poisoned(tensor: torch.Tensor, value: float = torch.nan) -> torch.Tensor:
 
 
 ACTOR, ADAM, ENV = "actor_state_dict", "optimizer_state_dict", "infos|env"
+OTHER, VERSION, INFINITE, BELOW = "does not fit this task: ", "is of another version: its ", "not finite", "below 0"
+WEIGHT, MOMENTS, GROUP = f"{ACTOR}|mlp.0.weight", f"{ADAM}|state|0", f"{ADAM}|param_groups|0"
 CONTENTS: list[tuple[str, Change, str]] = [
-    ("no critic", drop("critic_state_dict"), "holds an actor only"),
-    ("no counter", drop("iter"), "iter is None, it must be a whole number from 0"),
-    ("counter below 0", set_at("iter", -1), "iter is -1"),
-    ("counter is NaN", set_at("iter", float("nan")), "iter is nan"),
-    ("counter is true", set_at("iter", True), "iter is True"),
-    ("counter is text", set_at("iter", "5"), "iter is '5'"),
-    (
-        "another counter than the name",
-        set_at("iter", 6),
-        "its name says 5 iterations, and it has done 6: call it model_6.pt",
-    ),
-    ("steps below 0", set_at("infos|total_steps", -3), "infos: total_steps is -3"),
-    ("seconds are NaN", set_at("infos|seconds", float("nan")), "infos: seconds is nan, it must be a number from 0"),
-    ("infos is a list", set_at("infos", [1]), "infos is [1], it must be a mapping"),
-    (
-        "NaN in a weight",
-        set_at(f"{ACTOR}|mlp.0.weight", poisoned),
-        "actor_state_dict: mlp.0.weight has values that are not finite",
-    ),
-    (
-        "infinite bias",
-        set_at(f"{ACTOR}|mlp.0.bias", partial(poisoned, value=torch.inf)),
-        "mlp.0.bias has values that are not finite",
-    ),
-    (
-        "NaN in the critic",
-        set_at("critic_state_dict|mlp.0.weight", poisoned),
-        "critic_state_dict: mlp.0.weight has values",
-    ),
-    ("weight of another shape", set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(2, 2)), "mlp.0.weight is (2, 2) there"),
-    (
-        "weight of whole numbers",
-        set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.long()),
-        "mlp.0.weight is int64 there and float32 here",
-    ),
-    ("weight is a list", set_at(f"{ACTOR}|mlp.0.weight", [1.0]), "mlp.0.weight is [1.0], it must be a tensor"),
-    (
-        "weight is shown wider",
-        set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(1).expand(10**9)),
-        "shows 1000000000 numbers and has fewer",
-    ),
-    ("sparse weight", set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.to_sparse()), "it must be a tensor"),
-    ("a number as a name", lambda content: content[ACTOR].update({3: torch.zeros(1)}), "has a parameter called 3"),
-    (
-        "a weight too many",
-        lambda content: content[ACTOR].update(more=torch.zeros(1)),
-        "actor more is (1,) there and missing here",
-    ),
-    ("negative variance", set_at(f"{ACTOR}|obs_normalizer._var", lambda v: -v), "obs_normalizer._var is negative"),
-    ("negative count", set_at(f"{ACTOR}|obs_normalizer.count", lambda c: c - 9), "obs_normalizer.count is negative"),
-    ("networks are a list", set_at(ACTOR, []), "actor_state_dict is [], it must be a mapping"),
-    ("moments of another shape", set_at(f"{ADAM}|state|0|exp_avg", torch.zeros(3)), "exp_avg of parameter 0 is (3,)"),
-    ("moments of one number", set_at(f"{ADAM}|state|0|exp_avg_sq", torch.zeros(())), "exp_avg_sq of parameter 0 is ()"),
-    (
-        "moments are NaN",
-        set_at(f"{ADAM}|state|0|exp_avg", poisoned),
-        "exp_avg of parameter 0 has values that are not finite",
-    ),
-    (
-        "negative second moment",
-        set_at(f"{ADAM}|state|0|exp_avg_sq", partial(poisoned, value=-1.0)),
-        "exp_avg_sq of parameter 0 is negative",
-    ),
-    ("steps of Adam below 0", set_at(f"{ADAM}|state|0|step", torch.tensor(-1.0)), "step of parameter 0 is negative"),
-    (
-        "moments of complex numbers",
-        set_at(f"{ADAM}|state|0|exp_avg_sq", lambda m: m.to(torch.complex64)),
-        "is (12,) complex64",
-    ),
-    (
-        "no second moments",
-        lambda content: content[ADAM]["state"][0].pop("exp_avg_sq"),
-        "state of parameter 0 must have step, exp_avg, exp",
-    ),
-    ("a rate of many numbers", set_at(f"{ADAM}|param_groups|0|lr", torch.ones(3)), "lr is (3,) float32; that is none"),
-    ("Adam backwards", set_at(f"{ADAM}|param_groups|0|maximize", True), "maximize is True; that is none"),
-    ("no state", set_at(f"{ADAM}|state", {}), "optimizer_state_dict: state is empty"),
-    ("state of no parameter", lambda content: content[ADAM]["state"].update({99: {}}), "state 99 is of no parameter"),
-    ("rate below 0", set_at(f"{ADAM}|param_groups|0|lr", -1e-3), "lr is -0.001; that is none"),
-    ("rate is NaN", set_at(f"{ADAM}|param_groups|0|lr", float("nan")), "lr is nan; that is none"),
-    ("rate is text", set_at(f"{ADAM}|param_groups|0|lr", "fast"), "lr is 'fast'; that is none"),
-    ("betas above 1", set_at(f"{ADAM}|param_groups|0|betas", (5.0, 5.0)), "betas is (5.0, 5.0); that is none"),
-    ("no groups", set_at(f"{ADAM}|param_groups", []), "param_groups must be a list of "),
-    (
-        "groups of other parameters",
-        set_at(f"{ADAM}|param_groups|0|params", lambda p: p[::-1]),
-        "params must count the parameters, from",
-    ),
-    (
-        "random state of floats",
-        set_at("infos|random_state|cpu", torch.zeros(9)),
-        "cpu is no state of torch's generator",
-    ),
-    (
-        "random state cut",
-        set_at("infos|random_state|cpu", lambda state: state[:7]),
-        "cpu is no state of torch's generator",
-    ),
-    ("level below 0", set_at(f"{ENV}|kick_level", lambda level: level - 3), "infos: env: kick_level is negative"),
-    ("level of two axes", set_at(f"{ENV}|kick_level", lambda level: level[:, None]), "infos: env: kick_level is "),
-    ("no levels", set_at(f"{ENV}|kick_level", lambda level: level[:0]), "infos: env: kick_level is "),
+    ("no critic", drop("critic_state_dict"), "holds no critic_state_dict"),
+    ("no counter", drop("iter"), "holds no iter"),
+    ("counter below 0", set_at("iter", -1), VERSION),
+    ("counter is NaN", set_at("iter", float("nan")), VERSION),
+    ("counter is true", set_at("iter", True), VERSION),
+    ("counter is text", set_at("iter", "5"), VERSION),
+    ("another counter than the name", set_at("iter", 6), "call it model_6.pt"),
+    ("steps below 0", set_at("infos|total_steps", -3), VERSION),
+    ("seconds are NaN", set_at("infos|seconds", float("nan")), VERSION),
+    ("infos is a list", set_at("infos", [1]), VERSION),
+    ("NaN in a weight", set_at(WEIGHT, poisoned), INFINITE),
+    ("infinite bias", set_at(f"{ACTOR}|mlp.0.bias", partial(poisoned, value=torch.inf)), INFINITE),
+    ("NaN in the critic", set_at("critic_state_dict|mlp.0.weight", poisoned), INFINITE),
+    ("weight of another shape", set_at(WEIGHT, torch.zeros(2, 2)), f"{OTHER}actor mlp.0.weight"),
+    ("weight of whole numbers", set_at(WEIGHT, lambda w: w.long()), f"{OTHER}actor mlp.0.weight"),
+    ("weight is a list", set_at(WEIGHT, [1.0]), VERSION),
+    ("weight is shown wider", set_at(WEIGHT, torch.zeros(1).expand(10**9)), VERSION),
+    ("sparse weight", set_at(WEIGHT, lambda w: w.to_sparse()), VERSION),
+    ("a number as a name", lambda content: content[ACTOR].update({3: torch.zeros(1)}), VERSION),
+    ("a weight too many", lambda content: content[ACTOR].update(more=torch.zeros(1)), f"{OTHER}actor more"),
+    ("negative variance", set_at(f"{ACTOR}|obs_normalizer._var", lambda v: -v), BELOW),
+    ("negative count", set_at(f"{ACTOR}|obs_normalizer.count", lambda c: c - 9), BELOW),
+    ("networks are a list", set_at(ACTOR, []), VERSION),
+    ("moments of another shape", set_at(f"{MOMENTS}|exp_avg", torch.zeros(3)), f"{OTHER}{ADAM} 0.exp_avg"),
+    ("moments of one number", set_at(f"{MOMENTS}|exp_avg_sq", torch.zeros(())), f"{OTHER}{ADAM} 0.exp_avg_sq"),
+    ("moments are NaN", set_at(f"{MOMENTS}|exp_avg", poisoned), INFINITE),
+    ("negative second moment", set_at(f"{MOMENTS}|exp_avg_sq", partial(poisoned, value=-1.0)), BELOW),
+    ("steps of Adam below 0", set_at(f"{MOMENTS}|step", torch.tensor(-1.0)), BELOW),
+    ("moments of complex numbers", set_at(f"{MOMENTS}|exp_avg_sq", lambda m: m.to(torch.complex64)), OTHER),
+    ("no second moments", drop(f"{MOMENTS}|exp_avg_sq"), f"{OTHER}{ADAM} 0.exp_avg_sq is missing"),
+    ("a rate of many numbers", set_at(f"{GROUP}|lr", torch.ones(3)), VERSION),
+    ("Adam backwards", set_at(f"{GROUP}|maximize", True), VERSION),
+    ("no state", set_at(f"{ADAM}|state", {}), VERSION),
+    ("state of no parameter", set_at(f"{ADAM}|state|99", {}), VERSION),
+    ("state of a parameter from the end", set_at(f"{ADAM}|state", lambda state: {-1: state[0]}), VERSION),
+    ("rate below 0", set_at(f"{GROUP}|lr", -1e-3), VERSION),
+    ("rate of 0", set_at(f"{GROUP}|lr", 0.0), VERSION),
+    ("rate is NaN", set_at(f"{GROUP}|lr", float("nan")), VERSION),
+    ("rate is text", set_at(f"{GROUP}|lr", "fast"), VERSION),
+    ("rate beyond any float", set_at(f"{GROUP}|lr", 10**400), VERSION),
+    ("no betas", drop(f"{GROUP}|betas"), VERSION),
+    ("no parameters", drop(f"{GROUP}|params"), VERSION),
+    ("betas above 1", set_at(f"{GROUP}|betas", (5.0, 5.0)), VERSION),
+    ("no groups", set_at(f"{ADAM}|param_groups", []), VERSION),
+    ("groups of other parameters", set_at(f"{GROUP}|params", lambda p: p[::-1]), VERSION),
+    ("random state of floats", set_at("infos|random_state|cpu", torch.zeros(9)), VERSION),
+    ("random state cut", set_at("infos|random_state|cpu", lambda state: state[:7]), VERSION),
+    ("level below 0", set_at(f"{ENV}|kick_level", lambda level: level - 3), BELOW),
+    ("level of two axes", set_at(f"{ENV}|kick_level", lambda level: level[:, None]), f"{OTHER}infos.env kick_level"),
+    ("no levels", set_at(f"{ENV}|kick_level", lambda level: level[:0]), f"{OTHER}infos.env kick_level"),
 ]
 
 

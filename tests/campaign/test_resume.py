@@ -12,7 +12,8 @@ import pytest
 import torch
 from program import SMALL, Result, assert_equal, load, refused, run, trained
 
-from legged_mw.rl.checkpoint import Checker, beyond, save_whole
+from legged_mw.envs.snapshot import beyond
+from legged_mw.rl.checkpoint import check_fit, save_whole
 from legged_mw.rl.run_folder import CheckpointWriter, checkpoints
 
 EXACTLY = "exactly: worlds and generators go on where they were"
@@ -126,7 +127,7 @@ def test_a_buffer_of_a_users_own_goes_on_or_costs_the_word(made: str, eager: lis
 
 def test_a_number_of_a_users_task_may_be_below_zero() -> None:
     best = {"best_reward": torch.tensor([-3.0])}
-    Checker(Path("model_1.pt")).task({"env": best}, best)
+    check_fit(best, best, Path("model_1.pt"), "infos.env")
 
 
 @pytest.mark.parametrize("value", [torch.nan, -torch.inf, 1e30])
