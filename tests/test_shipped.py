@@ -24,6 +24,7 @@ from legged_mw.export.exporter import FILES
 from legged_mw.export.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.run_folder import update_from_run
+from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.files import digest
 from legged_mw.utils.task import LoadedTask, load_task
@@ -91,6 +92,7 @@ def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
 
 def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tmp_path: Path) -> None:
     """Of g1_flat, whose policy asks its ankles for more than their range in every step; the scene is not there."""
+    seed_everything(0)  # two simulations of an arbitrary walk may part by more than is compared
     folder, task = ROOT / "resources/policies/g1_flat", load_task("g1_flat")
     update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
     rollout.prepare(task)
