@@ -493,7 +493,10 @@ class Ends(NamedTuple):
     not_covered: tuple[str, ...] = ()  # the task's own methods that ended episodes in training; not checked here
 
     def tilted(self, gravity: np.ndarray) -> np.ndarray:
-        """True if ``gravity`` (..., 3), its direction in the body frame, means a fall; also for NaN."""
+        """True if ``gravity`` (..., 3), its direction in the body frame, means a fall; also for NaN.
+
+        The limit of the robot itself is ``Safety._tilt``.
+        """
         if self.max_tilt is None:
             return np.zeros(gravity.shape[:-1], dtype=bool)
         return ~(gravity[..., 2] <= -math.cos(math.radians(self.max_tilt)))

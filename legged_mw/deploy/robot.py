@@ -124,7 +124,10 @@ class Robot(ABC):
         """Switch the servos off, so joints are only damped, and close links. Safe to call twice, and after an error."""
 
     def damp(self) -> None:
-        """For the next period: no stiffness, joints damped. By default it closes the robot, which ends the run."""
+        """For the next period: no stiffness, joints damped. By default it closes the robot.
+
+        That ends the run; a robot that stays connected overrides it, and the run goes on damped.
+        """
         self.close()
 
     def limp(self) -> None:

@@ -312,6 +312,7 @@ class Safety:
         )
 
     def _tilt(self, measured: Measurement) -> Trip | None:
+        """The robot's own limit. The task's rule of a fall is ``Ends.tilted``, which counts under the policy alone."""
         tilt = math.degrees(math.acos(np.clip(-measured.gravity[2], -1.0, 1.0)))
         return (
             None

@@ -375,7 +375,7 @@ class Runner(OnPolicyRunner):
             self._open_curves()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Write a checkpoint, whole or not at all."""
+        """rsl-rl's method: one checkpoint, whole or not at all. Training itself calls ``_save_checkpoint``."""
         save_whole(self._content(infos), Path(path))
         self.logger.save_model(path, self.current_learning_iteration)
 

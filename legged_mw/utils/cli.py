@@ -151,9 +151,9 @@ def duration(text: str) -> float:
 def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
     """End the program with one line and exit code 2 after a mistake of the user, in a request or in their own code.
 
-    --verbose adds the traceback. If memory runs out, the line ends with the advice ``fewer``. Ctrl-C gives code 130,
-    where no program takes it for its normal end. Our own mistakes stay tracebacks. If the console closes, as in
-    ``| head``, the program goes on.
+    --verbose adds the traceback. If memory runs out, the line ends with the advice ``fewer``. Ctrl-C gives code 130
+    where the program does not handle it: a training saves and ends with code 3 (rl/training.py). Our own mistakes stay
+    tracebacks. If the console closes, as in ``| head``, the program goes on.
     """
     program = program or Path(sys.argv[0]).name
     try:
