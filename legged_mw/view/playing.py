@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,7 +30,6 @@ from legged_mw.rl.flags import require_task
 from legged_mw.rl.policies import PolicySource, actor_in, introduce, load_policy
 from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.rl.run_folder import checkpoints, reason_of
-from legged_mw.rl.runner import Runner
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
@@ -44,6 +43,9 @@ from legged_mw.utils.machine import has_display
 from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.stage import BoolArray, FloatArray
+
+if TYPE_CHECKING:  # it imports git, a tenth of a second that play does not need
+    from legged_mw.rl.runner import Runner
 
 NOMINAL = {  # overrides of the trained config for playing
     "env.num_envs": 1,
