@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import BOUND
-from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, sum_rows, update_normalizer
+from legged_mw.rl.networks import HalfWeights, elu_layers, kernels_for, run_mlp, sample, sum_rows, update_normalizer
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
