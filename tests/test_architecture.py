@@ -317,7 +317,7 @@ def test_the_import_rules_themselves() -> None:
         ("legged_mw/sim/graph.py", "if TYPE_CHECKING:\n    import legged_mw.envs", True),
         ("legged_mw/rl/ppo.py", "from legged_mw.rl.students.recurrent import HiddenState", True),
         ("legged_mw/rl/runner.py", "def f():\n    from legged_mw.rl.students import estimator", True),
-        ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.ppo import RememberingModel", False),
+        ("legged_mw/rl/students/recurrent.py", "from legged_mw.rl.networks import RememberingModel", False),
         ("legged_mw/eval/rollout.py", "from legged_mw.rl.students.recurrent import forget", False),
         ("legged_mw/export/exporter.py", "from legged_mw.rl.students.recurrent import states_of", False),
         ("legged_mw/rl/runner.py", "import rsl_rl.runners", False),
