@@ -25,6 +25,8 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.envs.mirror import Columns
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import BOUND
 from legged_mw.rl.networks import (
     HalfWeights,
@@ -766,3 +768,25 @@ class FlatAdam:
         square.mul_(beta2).addcmul_(gradient, gradient, value=1.0 - beta2)
         divisor = (square / (1.0 - beta2**count)).sqrt_().add_(eps)
         self._values.mul_(1.0 - rate.double() * decay).sub_(mean / divisor * (rate / (1.0 - beta1**count)))
+
+
+# ---- mirror images --------------------------------------------------------------------------------------------------
+
+
+def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
+    """rsl-rl's ``data_augmentation_func``: the observations and actions of B samples, then of their mirror images.
+
+    Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024.
+
+    ``obs`` may hold any of the environment's groups. A CUDA graph can record it: no read from the device. Look
+    at ``env.mirror`` before recording, as its first use makes tensors.
+    """
+    table = env.mirror
+    if obs is not None:
+        groups = {name: _with_image(value, table.observations[name]) for name, value in obs.to_dict().items()}
+        obs = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
+    return obs, None if actions is None else _with_image(actions, table.actions)
+
+
+def _with_image(x: Tensor, columns: Columns) -> Tensor:
+    return torch.cat([x, columns(x)])

@@ -1,4 +1,4 @@
-"""The learner's config as rsl-rl takes it: settings, the classes that a config may name, their memory, mirror images.
+"""The learner's config as rsl-rl takes it: settings, the classes that a config may name, their memory.
 
 Not in learner_config.py: tasks import that, and it holds numbers and names only.
 """
@@ -12,15 +12,11 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
-import torch
 from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.models import CNNModel, MLPModel, RNNModel
 from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
 from rsl_rl.utils import resolve_callable, resolve_class
-from tensordict import TensorDict
-from torch import Tensor
 
-from legged_mw.envs.mirror import Columns
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.ppo import MAX_RATE
@@ -45,7 +41,7 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[st
     keys = ("num_steps_per_env", "save_interval", "keep_checkpoints", "exam_interval", "experiment_name", "run_name")
     symmetry = sections.pop("symmetry")
     mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
-    symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.rsl_rl_settings:mirror", **symmetry} if mirrors else None
+    symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.ppo:mirror", **symmetry} if mirrors else None
     algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
     _check_bound(algorithm)
     anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
@@ -240,25 +236,3 @@ def _weights(sections: dict[str, Any], name: str, seen: int) -> dict[str, int]:
 
 def _chain(sizes: list[int]) -> int:
     return sum(before * after for before, after in pairwise(sizes))
-
-
-# ---- symmetry -------------------------------------------------------------------------------------------------------
-
-
-def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
-    """rsl-rl's ``data_augmentation_func``: the observations and actions of B samples, then of their mirror images.
-
-    Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024.
-
-    ``obs`` may hold any of the environment's groups. A CUDA graph can record it: no read from the device. Look
-    at ``env.mirror`` before recording, as its first use makes tensors.
-    """
-    table = env.mirror
-    if obs is not None:
-        groups = {name: _with_image(value, table.observations[name]) for name, value in obs.to_dict().items()}
-        obs = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
-    return obs, None if actions is None else _with_image(actions, table.actions)
-
-
-def _with_image(x: Tensor, columns: Columns) -> Tensor:
-    return torch.cat([x, columns(x)])
