@@ -19,8 +19,8 @@ from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
+from legged_mw.rl.learner_config import rsl_rl_config
 from legged_mw.rl.ppo import mirror
-from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.rl.run_folder import update_from_run
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
