@@ -171,7 +171,7 @@ def test_every_allowed_class_is_one_that_rsl_rl_finds_under_that_name() -> None:
     for path, kinds in ALLOWED.items():
         for kind in kinds:
             for name in spellings(kind):
-                assert resolve_callable(name) is (resolve_callable(kind) if isinstance(kind, str) else kind)
+                assert resolve_callable(name) is resolve_callable(kind)
                 task = load_task("go1_flat")
                 if not path.startswith("critic.distribution"):  # a section that the critic has not
                     task.set(path, name)

@@ -11,15 +11,8 @@ import importlib.util
 import inspect
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rsl_rl.algorithms import PPO, Distillation
-from rsl_rl.models import CNNModel, MLPModel, RNNModel
-from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
-from rsl_rl.utils import resolve_callable, resolve_class
-
-from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.utils.bounds import (
     SOME,
     Bound,
@@ -39,6 +32,10 @@ from legged_mw.utils.files import MOST_LETTERS, wrong_name
 from legged_mw.utils.machine import require_memory
 from legged_mw.utils.task import LoadedTask
 
+if TYPE_CHECKING:
+    from legged_mw.envs.robot_task import RobotTask
+
+MAX_RATE = 1e-2  # that rsl-rl's adaptive learning rate goes up to
 Iterations = Annotated[int, at_least(0, 1_000_000)]
 Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
 Sizes = Annotated[list[Count], SOME]  # of layers
@@ -140,9 +137,8 @@ class RobotTaskCfgPPO(Config):
         use_clipped_value_loss: bool = True  # [P]
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
         desired_kl: Positive = 0.01  # between updates, for the adaptive schedule [R]
-        max_learning_rate: PositiveShare = (
-            1e-2  # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
-        )
+        # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
+        max_learning_rate: PositiveShare = MAX_RATE
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
     class distillation:
@@ -279,7 +275,7 @@ def _check_bound(algorithm: dict[str, Any]) -> None:
         del algorithm["max_learning_rate"]
         return
     name, rate, bound = (algorithm[key] for key in ("class_name", "learning_rate", "max_learning_rate"))
-    if name in spellings(PPO):
+    if name in spellings(_PPO):
         raise ConfigError(
             f"algorithm.max_learning_rate: rsl-rl's own {name} goes up to {MAX_RATE:g}; GraphedPPO takes another"
         )
@@ -298,15 +294,25 @@ def _check_bound(algorithm: dict[str, Any]) -> None:
 # ---- classes --------------------------------------------------------------------------------------------------------
 
 
-_NETWORKS = (MLPModel, CNNModel, RNNModel)
-_DISTRIBUTIONS = (GaussianDistribution, HeteroscedasticGaussianDistribution)
-ALLOWED: dict[str, tuple[type | str, ...]] = {
+# As strings, ``module:name``: a task that is only loaded, or listed, waits for no import of rsl-rl.
+_PPO = "rsl_rl.algorithms.ppo:PPO"
+_RNN = "rsl_rl.models.rnn_model:RNNModel"
+_NETWORKS = ("rsl_rl.models.mlp_model:MLPModel", "rsl_rl.models.cnn_model:CNNModel", _RNN)
+_DISTRIBUTIONS = (
+    "rsl_rl.modules.distribution:GaussianDistribution",
+    "rsl_rl.modules.distribution:HeteroscedasticGaussianDistribution",
+)
+_BETA = "rsl_rl.modules.distribution:BetaDistribution"
+ALLOWED: dict[str, tuple[str, ...]] = {
     "actor.class_name": _NETWORKS,
     "critic.class_name": _NETWORKS,
     "actor.distribution_cfg.class_name": _DISTRIBUTIONS,
     "critic.distribution_cfg.class_name": _DISTRIBUTIONS,
-    "algorithm.class_name": ("legged_mw.rl.ppo:GraphedPPO", PPO),
-    "distillation.class_name": ("legged_mw.rl.students.distillation:GraphedDistillation", Distillation),
+    "algorithm.class_name": ("legged_mw.rl.ppo:GraphedPPO", _PPO),
+    "distillation.class_name": (
+        "legged_mw.rl.students.distillation:GraphedDistillation",
+        "rsl_rl.algorithms.distillation:Distillation",
+    ),
 }
 _RECURRENT = "legged_mw.rl.students.recurrent:RecurrentModel"  # takes the place of rsl-rl's RNNModel
 # the field of section `actor` that selects it -> the network, imported when it is selected
@@ -356,6 +362,8 @@ def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool
     if actor["class_name"] != "MLPModel":
         raise ConfigError(f"{fields[0]}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
     assert env is not None
+    from rsl_rl.utils import resolve_callable
+
     name = _STUDENTS[fields[0]]
     model: Any = resolve_callable(name)
     return {**actor, **model.settings(sections, env, learns), "class_name": name}
@@ -366,7 +374,9 @@ def network_section(section: dict[str, Any]) -> dict[str, Any]:
 
     Imports the class: check it first.
     """
-    if section["class_name"] in spellings(RNNModel):
+    from rsl_rl.utils import resolve_class
+
+    if section["class_name"] in spellings(_RNN):
         section = {**section, "class_name": _RECURRENT}
     taken = inspect.signature(resolve_class(section)[0]).parameters
     return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
@@ -375,19 +385,23 @@ def network_section(section: dict[str, Any]) -> dict[str, Any]:
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
     """Raise ConfigError if a distribution of rsl-rl does not take all fields of its section."""
     name = (section or {}).get("class_name")
-    for kind in (*_DISTRIBUTIONS, BetaDistribution):
-        surplus = sorted((section or {}).keys() - inspect.signature(kind).parameters.keys() - {"class_name"})
-        if surplus and name in spellings(kind):
-            fit = ", ".join(other.__name__ for other in _DISTRIBUTIONS)
+    for kind in (*_DISTRIBUTIONS, _BETA):
+        if section is None or name not in spellings(kind):
+            continue
+        from rsl_rl.utils import resolve_callable
+
+        surplus = sorted(section.keys() - inspect.signature(resolve_callable(kind)).parameters.keys() - {"class_name"})
+        if surplus:
+            fit = ", ".join(other.partition(":")[2] for other in _DISTRIBUTIONS)
             raise ConfigError(
                 f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; "
                 f"there fit: {fit}"
             )
 
 
-def spellings(kind: type | str) -> list[str]:
-    """All names by which rsl-rl finds a class, the shortest first. A string is ``module:name``."""
-    module, name = kind.split(":") if isinstance(kind, str) else (kind.__module__, kind.__qualname__)
+def spellings(kind: str) -> list[str]:
+    """All names by which rsl-rl finds the class ``module:name``, the shortest first."""
+    module, name = kind.split(":")
     long = [f"{module}:{name}", f"{module}.{name}"]
     if not module.startswith("rsl_rl."):
         return long

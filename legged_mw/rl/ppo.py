@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from legged_mw.envs.mirror import Columns
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import BOUND
+from legged_mw.rl.learner_config import MAX_RATE
 from legged_mw.rl.networks import (
     HalfWeights,
     Memories,
@@ -45,7 +46,7 @@ from legged_mw.rl.networks import (
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
-_MIN_RATE, MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
+_MIN_RATE, _RATE_STEP = 1e-5, 1.5  # of the adaptive learning rate, as in rsl-rl
 
 
 class Recorded:
