@@ -55,6 +55,7 @@ def steady(fps: float = 30.0, frames: int = 31) -> Clip:
 
 
 def test_a_clip_at_another_rate_is_the_same_motion() -> None:
+    assert steady(frames=2).seconds == pytest.approx(1 / 30)  # two frames are enough
     clip = steady().at(50.0)
     assert len(clip.root_pos) == 51 and clip.seconds == pytest.approx(1.0)
     for ours, right in zip(clip[2:], steady(50.0, 51)[2:], strict=True):
