@@ -80,6 +80,27 @@ def test_stairs_are_stairs() -> None:
             assert along[round(PLATFORM / 0.1)] == along[0]
 
 
+def test_each_kind_is_as_high_and_wide_as_it_says() -> None:
+    """Tiles of 8 m at full difficulty, level within 1 m of the middle and in the last 0.5 m."""
+    grid, rng = Grid(80, 0.1, pit=False), np.random.default_rng(0)
+    hard = {name: kind(grid, 1.0, rng) for name, kind in KINDS.items()}
+    found = {name: (hard[name].min().round(6), hard[name].max().round(6)) for name in hard}
+    assert found["smooth_slope"] == (0.0, 0.4 * 2.5) and found["gap"] == (-0.5, 0.0)
+    assert np.abs(np.diff(hard["smooth_slope"], axis=0)).max() == pytest.approx(0.04)
+    assert set(np.unique(hard["obstacles"])) == {-0.25, -0.125, 0.0, 0.125, 0.25}
+    assert set(np.unique(hard["stepping_stones"])) == {-0.3, 0.0}
+    noise = hard["rough_slope"] - hard["smooth_slope"]
+    for rough, low, high in ((noise, -0.05, 0.05), (hard["waves"], -0.15, 0.15), (hard["low_random"], 0.0, 0.05)):
+        assert low <= rough.min() <= low + 0.03 and high - 0.03 <= rough.max() <= high
+    wave = hard["waves"][10]  # 2 m long
+    assert np.ptp(wave[10:30]) > 0.1 and wave[10:50] == pytest.approx(wave[30:70])
+    assert KINDS["low_random"](grid, 0.5, rng).max() <= 0.025
+    assert np.flatnonzero(hard["gap"][40]).tolist() == [*range(24, 30), *range(51, 57)]  # 0.6 m behind the platform
+    holes = hard["stepping_stones"][10] < 0.0  # stones of 0.3 m, gaps of 0.2 m
+    edges = np.flatnonzero(np.diff(holes[5:76].astype(int)))
+    assert set(np.diff(edges)[1:-1]) == {2, 3}
+
+
 def test_slopes_go_up_and_down_in_turn() -> None:
     """Along a column, and side by side: two columns of a kind have one of each at every level."""
     ground = terrain(proportions={"smooth_slope": 1.0, "rough_slope": 1.0}, columns=4)
