@@ -15,13 +15,14 @@ from torch import Tensor
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.checkpoint import check_fit, load_tensors
 from legged_mw.rl.learner_config import actor_settings, check_classes, check_room, network_section
 from legged_mw.rl.run_folder import (
     CONFIG_FILE,
+    check_fit,
     experiment_folder,
     find_checkpoint,
     find_run,
+    load_tensors,
     runs,
     task_of,
     update_from_run,
