@@ -44,7 +44,7 @@ from legged_mw.rl.iteration_log import (
 )
 from legged_mw.rl.learner_config import RobotTaskCfgPPO, rsl_rl_config
 from legged_mw.rl.networks import RegressingModel
-from legged_mw.rl.policies import acting
+from legged_mw.rl.policies import TEACHER, acting, adapt
 from legged_mw.rl.ppo import GraphedPPO, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
 from legged_mw.rl.run_folder import (
@@ -57,7 +57,6 @@ from legged_mw.rl.run_folder import (
     unpack,
     worlds_file,
 )
-from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
