@@ -25,8 +25,8 @@ from legged_mw.rl import run_folder, training
 from legged_mw.rl.ranks import Rank
 from legged_mw.rl.run_folder import LOCK_FILE, CheckpointWriter, RunLock, checkpoints
 from legged_mw.rl.runner import Runner
+from legged_mw.utils.cli import SafeStream
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.console import SafeStream
 
 RUN = ["--seed", "1", "--eager", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
 GO_ON = ["--task", "go1_flat", "--device", "cpu", "--resume"]
@@ -156,7 +156,7 @@ def test_a_logger_that_does_not_start_ends_nothing(tmp_path: Path, monkeypatch: 
 
 def test_what_nobody_reads_is_lost(tmp_path: Path) -> None:
     """The pipe to a pager that was closed; then even the end of the program finds nothing wrong."""
-    program = "import sys\nfrom legged_mw.utils.console import patient_console\nwith patient_console():\n"
+    program = "import sys\nfrom legged_mw.utils.cli import patient_console\nwith patient_console():\n"
     program += (
         "    for i in range(20000):\n        print('a line', i)\n    open(sys.argv[1], 'w').write('got to its end')"
     )
