@@ -20,7 +20,6 @@ import struct
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
@@ -493,7 +492,7 @@ def check_resume(
         check_fit({name: levels[name] for name in wanted}, wanted, path, "infos.env")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _part(path: Path, name: str) -> Iterator[None]:
     """Any error in the body means that the part ``name`` of the file is none of this version."""
     try:
