@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from legged_mw.eval import hard
+from legged_mw.eval import hard, report
 from legged_mw.eval.hard import Walk, looks
+from legged_mw.eval.report import Column
 from legged_mw.eval.walking import ExamRules
 
 STEP, PERIOD, SECONDS = 0.002, 0.02, 8.0
@@ -179,3 +180,16 @@ def test_ready_for_a_robot(found: dict[str, Any], words: list[str]) -> None:
     assert found["ready"] == (not words) and len(found["misses"]) == len(words)
     assert all(word in miss for word, miss in zip(words, found["misses"], strict=True))
     assert hard.table(found)
+
+
+def test_its_chapter_in_the_report() -> None:
+    column = Column("mine", {}, {"hard": result(falls=1)}, strip=b"PNG")
+    page = report._hard(column)
+    assert page.count("<tr>") == 1 + len(hard.CONDITIONS) + 1 + len(hard.figures(column.exam["hard"])) - page.count(
+        'class="sub"'
+    )
+    assert "falls under all" in page and "data:image/png;base64" in page and "load of 3 kg" in page
+    assert "strip" not in column.plain()
+    fallen = {**column.exam["hard"], "looks": None}
+    assert hard.misses(fallen)[-1] == "falls while it is looked at" and hard.figures(fallen) == []
+    assert report._hard(Column("mine", {}, {"hard": fallen}))
