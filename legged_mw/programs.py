@@ -94,8 +94,8 @@ def play() -> None:
     """Watch, grade or export a policy."""
     start_quickly()
     from legged_mw.eval import exams
+    from legged_mw.rl.learner_config import check_classes
     from legged_mw.rl.policies import find_policy, find_rival, introduce, load_trained
-    from legged_mw.rl.rsl_rl_settings import check_classes
     from legged_mw.view import playing
 
     args = playing.parse(play.__doc__)

@@ -16,8 +16,7 @@ import yaml
 from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
-from legged_mw.rl.learner_config import fit_cpu
-from legged_mw.rl.rsl_rl_settings import check_classes
+from legged_mw.rl.learner_config import check_classes, fit_cpu
 from legged_mw.rl.run_folder import update_from_run
 from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml

@@ -16,8 +16,8 @@ from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Policy, TrainingExam
 from legged_mw.eval.skills import SKILLS, Skill
 from legged_mw.eval.walking import ExamRules, in_common
+from legged_mw.rl.learner_config import check_classes
 from legged_mw.rl.policies import PolicySource, introduce, load_policy
-from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.sim.simulation import overflow_note
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError

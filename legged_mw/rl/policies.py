@@ -16,7 +16,7 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.checkpoint import check_fit, load_tensors
-from legged_mw.rl.rsl_rl_settings import actor_settings, check_classes, check_room, network_section
+from legged_mw.rl.learner_config import actor_settings, check_classes, check_room, network_section
 from legged_mw.rl.run_folder import (
     CONFIG_FILE,
     experiment_folder,

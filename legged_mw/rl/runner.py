@@ -43,11 +43,11 @@ from legged_mw.rl.iteration_log import (
     curves,
     quiet_writers,
 )
-from legged_mw.rl.learner_config import RobotTaskCfgPPO
+from legged_mw.rl.learner_config import RobotTaskCfgPPO, rsl_rl_config
+from legged_mw.rl.networks import RegressingModel
 from legged_mw.rl.policies import acting
-from legged_mw.rl.ppo import GraphedPPO, RegressingModel, UpdateRollback
+from legged_mw.rl.ppo import GraphedPPO, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
-from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.rl.run_folder import CheckpointWriter, reason_of, worlds_file
 from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.utils.config import ConfigError

@@ -27,8 +27,8 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.checkpoint import load_tensors, save_whole
 from legged_mw.rl.flags import require_task
+from legged_mw.rl.learner_config import check_classes
 from legged_mw.rl.policies import PolicySource, actor_in, introduce, load_policy
-from legged_mw.rl.rsl_rl_settings import check_classes
 from legged_mw.rl.run_folder import checkpoints, reason_of
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget

@@ -25,8 +25,8 @@ from legged_mw.eval.exams import find_exam, require_exam
 from legged_mw.eval.rough import make_room
 from legged_mw.eval.walking import ExamRules, in_common
 from legged_mw.rl.policies import PolicySource, Trained, find_rival
+from legged_mw.rl.ppo import mirror
 from legged_mw.rl.ranks import Rank, rank_device
-from legged_mw.rl.rsl_rl_settings import mirror
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.transfer import check_start
 from legged_mw.utils.commands import Command
