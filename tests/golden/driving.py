@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from drivers import Script, Watched, driven
-from wires import Owner
 
 from golden.table import Run, Table, patched, without
 from legged_mw import ROOT
@@ -34,6 +33,7 @@ from legged_mw.unitree.client import Direct, UnitreeRobot, check_rows
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.robots import G1, GO2, check_body, machine_of
+from tests.wires import Owner
 
 GO2_FLAT = ROOT / "resources/policies/go2_flat"
 CONTRACT = read_contract(GO2_FLAT)
