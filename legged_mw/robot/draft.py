@@ -271,6 +271,17 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     return [_foot(robot, body, soles[body]) for body in sorted(soles)]
 
 
+def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
+    """Raise ModelError if the file's mesh of a low end of a limb cannot be read: it may be a foot."""
+    model, data = robot.physics, posed(robot.physics, qpos[7:], qpos[:7])
+    low = min(float(data.geom_xpos[robot.id("geom", geom), 2]) for foot in feet for geom in foot.geoms)
+    for body in {*range(1, model.nbody)} - {*model.body_parentid}:
+        name = model.body(body).name
+        is_low = data.xpos[body, 2] < 0.5 * (low + float(qpos[2]))
+        if name in robot.names.lost and not robot.names.bodies[name] and is_low:
+            raise ModelError(robot.names.lost[name])
+
+
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
     """The sole of a body: its lowest geom, and geoms of that type at about that height.
 
