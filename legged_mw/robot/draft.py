@@ -25,8 +25,10 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.robot.makers import Maker, find_maker
 from legged_mw.robot.measure import (
+    GRAVITY,
     Gains,
     Joint,
+    beyond_euler,
     mass_matrices,
     stand_as_statue,
     stand_on_servos,
@@ -44,6 +46,8 @@ from legged_mw.utils.task import import_task
 LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
 # factors on the suggested gains; published gains are at most twice the suggested ones [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
+# of the solver under implicitfast [ours: with 1 and 5 no robot stands, with 3 and 5 one of four falls]
+IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
@@ -60,6 +64,7 @@ class Draft(NamedTuple):
     pose_from: str  # source of the default pose, as text
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
     maker: Maker | None  # what its maker publishes, if that is known
+    gains_from: str  # source of the gains, as text
 
 
 def draft(file: Path) -> Draft:
@@ -93,37 +98,67 @@ def draft(file: Path) -> Draft:
         raise ModelError(
             f"'{robot.root}', the root, is not above the lowest ends of limbs, {ends}; the health page is of robots that stand on them"
         )
-    firmness, gains = _firm(robot, pose, place, joints, feet)
+    gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [
         f"pose: {how}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
-        "gains: as suggested below"
-        if firmness == 1.0
-        else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
+        f"gains: {gains_from}",
     ]
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker)
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker, gains_from)
 
 
-def _firm(
-    robot: RobotModel, pose: list[float], place: list[float], joints: Sequence[Joint], feet: Sequence[Foot]
-) -> tuple[float, list[Gains]]:
-    """The smallest of FIRMNESS at which the robot stands on its feet, and its gains.
+def _servos(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    maker: Maker | None,
+) -> tuple[list[Gains], str]:
+    """Gains of each joint, and where they come from: the maker's, else as suggested, else firmer.
 
-    1 if the robot stands at none of them, or has two feet: a biped falls over at any gains.
+    On more than two feet they are the smallest of FIRMNESS on which the robot stands. A biped falls on any.
     """
+    names = robot.joint_names
+    kp, kd = (maker.of(table, names) if maker else {} for table in ("kp", "kd"))
+    known = {name: Gains(kp[name], kd[name]) for name in names if name in kp and name in kd}
+    moment = GRAVITY * float(robot.physics.body_subtreemass[0]) * place[2]
+
+    def chosen(firmness: float) -> list[Gains]:
+        suggested = zip(names, suggest(joints, moment, firmness), strict=True)
+        return [known.get(name, gains) for name, gains in suggested]
+
+    if maker and len(known) == len(names):
+        return chosen(1.0), f"its maker's, {maker.source}"
+    some = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
+    for firmness in FIRMNESS if len(feet) > 2 else ():
+        if _stands(robot, pose, place, joints, feet, chosen(firmness)):
+            firmer = f"{firmness:g} times what is suggested below, to stand on its servos"
+            return chosen(firmness), ("as suggested below" if firmness == 1.0 else firmer) + some
+    return chosen(1.0), "as suggested below" + some
+
+
+def _stands(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    gains: Sequence[Gains],
+) -> bool:
+    """Whether the robot stands on its feet with these ``gains``."""
     model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
     for geom in range(robot.ground_geoms().stop, model.ngeom):
         model.geom_conaffinity[geom] *= model.geom(geom).name in touching
-    for firmness in FIRMNESS if len(feet) > 2 else ():
-        gains = suggest(joints, float(model.opt.timestep), firmness)
-        model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
-        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
-        firm = replace(robot, physics=model)
-        if stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
-            return firmness, gains
-    return 1.0, suggest(joints, float(model.opt.timestep))
+    model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
+    model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+    if beyond_euler(joints, gains, float(model.opt.timestep)):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations = IMPLICIT["iterations"], IMPLICIT["ls_iterations"]
+    firm = replace(robot, physics=model)
+    return stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands"
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
@@ -141,8 +176,8 @@ def _bare(file: Path, keyframe: bool) -> RobotTask:
 def as_env(found: Draft, file: Path) -> LeggedRobot:
     """One world of the draft's task."""
     cfg = parents(found)[0]()
-    cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
-    cfg.asset.file = str(file.resolve())
+    cfg.update({"env": {"num_envs": 1}, **values(found)}, where="the health page")
+    cfg.asset.file, cfg.sim.engine = str(file.resolve()), "mujoco"
     return LeggedRobot(cfg, "cpu")
 
 
@@ -171,7 +206,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if said := {
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
-        asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
+        asset["joint_speed_limits"] = short_table(said, names)
+    asset |= _motors(found)
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
@@ -184,10 +220,22 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
     }
+    if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
+        chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
     return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+
+
+def _motors(found: Draft) -> dict[str, dict[str, float]]:
+    """What a maker publishes of motors where the robot's file says nothing: armature [kg m^2], effort [N m]."""
+    if not found.maker:
+        return {}
+    bare = [joint.name for joint in found.joints if not joint.armature]
+    endless = [joint.name for joint in found.joints if not math.isfinite(joint.effort)]
+    said = {"armature": found.maker.of("armature", bare), "effort": found.maker.of("effort", endless)}
+    return {name: short_table(known, found.robot.joint_names) for name, known in said.items() if known}
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -219,6 +267,11 @@ def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
         if number != common:
             short[key] = number
     return short if _reads(short, names, numbers) else exact
+
+
+def short_table(said: dict[str, float], names: Sequence[str]) -> dict[str, float]:
+    """``table`` of numbers that are known for all ``names``; else ``said`` itself."""
+    return table([said[name] for name in names], names) if len(said) == len(names) else said
 
 
 def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[float]) -> bool:
