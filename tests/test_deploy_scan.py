@@ -14,9 +14,8 @@ import torch
 from worlds import QUIET, make_env
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import TERRAIN_FILE, Contract, ContractError, read_contract
+from legged_mw.deploy.contract import TERRAIN_FILE, Contract, ContractError, read_contract, sealed
 from legged_mw.deploy.controller import Controller
-from legged_mw.deploy.seal import sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.robot.mjcf import MOST_BYTES, XmlSource, write_archive

@@ -28,8 +28,7 @@ from legged_mw.deploy.contract import checksum, read_contract
 from legged_mw.deploy.controller import Network
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.rl import runner as running
-from legged_mw.rl.checkpoint import load_tensors, save_whole, sealed
-from legged_mw.rl.run_folder import checkpoints, find_run, runs
+from legged_mw.rl.run_folder import checkpoints, find_run, load_tensors, runs, save_whole, sealed
 from legged_mw.rl.runner import make_runner
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils import files

@@ -13,8 +13,7 @@ import torch
 from program import SMALL, Result, assert_equal, load, refused, run, trained
 
 from legged_mw.envs.snapshot import beyond
-from legged_mw.rl.checkpoint import check_fit, save_whole
-from legged_mw.rl.run_folder import CheckpointWriter, checkpoints
+from legged_mw.rl.run_folder import CheckpointWriter, check_fit, checkpoints, save_whole
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = [

@@ -17,8 +17,7 @@ from legged_mw.deploy import controller as policy
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.controller import Network
 from legged_mw.rl import policies
-from legged_mw.rl.checkpoint import load_tensors, save_whole
-from legged_mw.rl.run_folder import find_checkpoint, find_run, new_run
+from legged_mw.rl.run_folder import find_checkpoint, find_run, load_tensors, new_run, save_whole
 from legged_mw.rl.runner import Runner
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils import files

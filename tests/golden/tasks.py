@@ -24,11 +24,10 @@ from legged_mw.envs.mirror import Mirror
 from legged_mw.eval.exams import find_exam, require_exam
 from legged_mw.eval.rough import make_room
 from legged_mw.eval.walking import ExamRules, in_common
-from legged_mw.rl.policies import PolicySource, Trained, find_rival
+from legged_mw.rl.policies import PolicySource, Trained, check_start, find_rival
 from legged_mw.rl.ppo import mirror
 from legged_mw.rl.ranks import Rank, rank_device
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import check_start
 from legged_mw.utils.commands import Command
 from legged_mw.utils.task import LoadedTask, Task, load_task
 from legged_mw.view.drive import parse_command
