@@ -574,6 +574,16 @@ def test_a_fall_ends_the_episode_and_is_paid_for(quiet: LeggedRobot) -> None:
     assert (stats["episodes"], stats["fell"], stats["broken"]) == (1, 1, 0)
 
 
+def test_the_share_of_the_commanded_speed_that_worlds_walk() -> None:
+    """Of those that are told to walk: 0.5 of 1, 0 of 1, and backwards 1 of 2, in any direction."""
+    env = make_env(4, QUIET)
+    env.commands[:] = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.5], [-2.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    env.base_lin_vel[:] = torch.tensor([[0.5, 0.3, 0.0], [0.7, 0.0, 0.1], [-1.0, 0.2, 0.0], [3.0, 3.0, 0.0]])
+    assert env.read_statistics()["walked"] == pytest.approx(1.5 / 4.0)
+    env.commands.zero_()
+    assert "walked" not in env.read_statistics(), "nobody is told to walk"
+
+
 def test_time_out_at_exactly_the_episode_length() -> None:
     env = make_env(4, {**QUIET, "env.episode_length_s": 0.2})
     assert env.max_episode_length == 10

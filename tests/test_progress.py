@@ -66,6 +66,13 @@ def test_a_pipe_gets_a_line_an_iteration(
     assert "rew_pose: 0.1\n" in blocks and "Time elapsed, left: 0:03:00, 0:01:18\n" in blocks
 
 
+def test_the_line_of_a_walk_says_what_grows(capsys: pytest.CaptureFixture[str]) -> None:
+    """Its reward is clipped at 0 until it walks."""
+    Console().iteration(1, 2, None, {**NUMBERS, "walked": 0.344}, {}, 1.0)
+    line = capsys.readouterr().out
+    assert "walks 34% of the command, length -, episodes 7, falls 2" in line and "reward" not in line
+
+
 def test_the_time_that_is_left_ends_with_the_deadline(capsys: pytest.CaptureFixture[str], clock: list[float]) -> None:
     console = Console()
     console.deadline = clock[0] + 45.0

@@ -114,7 +114,8 @@ def test_configs_robots_and_policies_are_inside(installed: Path) -> None:
         inside, here = package / "resources" / folder, ROOT / "resources" / folder
         ours = {path.relative_to(here) for path in here.rglob("*") if path.is_file()}
         assert ours and ours == {path.relative_to(inside) for path in inside.rglob("*") if path.is_file()}
-    assert (package / "resources/peers.yaml").is_file()
+    for file in ("peers.yaml", "makers.yaml"):
+        assert (package / "resources" / file).is_file()
     [points] = installed.glob("*.dist-info/entry_points.txt")
     assert "legged-mw = legged_mw.programs:main" in points.read_text()
     # `configs` is nobody's top level

@@ -302,14 +302,25 @@ class LeggedRobot(RobotTask):
     # ---- statistics, checkpoint -------------------------------------------------------------------------------------
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Mean terrain levels, of all worlds and by kind, and the curriculum's share of the command ranges."""
-        live = super()._live_statistics()
+        """Share of the commanded speed; mean terrain levels, of all worlds and by kind; the curriculum's share."""
+        live = {**super()._live_statistics(), "walked": self._walked()}
         if self.tiles:
             live |= self.tiles.statistics()
         if self.cfg.commands.curriculum:
             share = self.command_curriculum[0]
             live["command_share"] = torch.stack([share, torch.ones_like(share)])
         return live
+
+    def _walked(self) -> Tensor:
+        """(2,) Present speed along the commanded direction, summed over worlds, and the commanded speed [m/s].
+
+        Their quotient is the share of the commanded distance that the robots walk.
+        """
+        wanted, measured = self.commands[:, :2], self.base_lin_vel[:, :2]
+        speed = wanted.square().sum(dim=1).sqrt()
+        along = (measured * wanted).sum(dim=1) / speed.clamp(min=1e-6)
+        asked = speed > self.cfg.rewards.min_command
+        return torch.stack([torch.where(asked, each, 0.0).sum() for each in (along, speed)])
 
     def training_state(self) -> dict[str, Tensor]:
         state = super().training_state()

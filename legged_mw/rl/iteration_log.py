@@ -98,7 +98,10 @@ class Report(NamedTuple):
 
 # ---- rows of the console, and curves --------------------------------------------------------------------------------
 
-_KNOWN = ("reward", "episode_length", "episodes", "fell", "broken", "overflowed", "learning_rate", "action_std")
+_KNOWN = (
+    *("reward", "episode_length", "episodes", "fell", "broken", "overflowed", "learning_rate", "action_std"),
+    "walked",  # share of the commanded speed, where a task commands one and a world is told to walk
+)
 _APART = ("rew_", "broken_by")  # prefixes of numbers that have lines of their own
 
 
@@ -118,6 +121,7 @@ def console_rows(
         "Action std": f"{numbers['action_std']:.2f}",
         "Mean reward": mean("reward", 2),
         "Mean episode length": mean("episode_length", 1),
+        **({"Share of the command walked": mean("walked", 2)} if "walked" in numbers else {}),
         **{name: mean(name, 4) for name in numbers if name.startswith("rew_")},
         **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in _of_the_task(numbers)},
         "Episodes ended": f"{numbers['episodes']:.0f} ({ends})",
@@ -137,6 +141,7 @@ def curves(
         "Perf/learning_time": learn,
         "Train/mean_reward": numbers["reward"],
         "Train/mean_episode_length": numbers["episode_length"],
+        **({"Train/walked": numbers["walked"]} if "walked" in numbers else {}),
         **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
         "Episode/fell": numbers["fell"],
         "Episode/broken": numbers["broken"],
@@ -302,8 +307,12 @@ class _Above:
 
 
 def _summary(numbers: Mapping[str, float]) -> str:
-    reward, length = _number(numbers["reward"], 2), _number(numbers["episode_length"], 1)
-    return f"reward {reward}, length {length}, episodes {numbers['episodes']:.0f}, falls {numbers['fell']:.0f}"
+    """What grows as a robot learns. A walk's reward is left out: its sum is clipped at 0, so that it long says nothing."""
+    first = f"reward {_number(numbers['reward'], 2)}"
+    if "walked" in numbers:
+        first = f"walks {100.0 * numbers['walked']:.0f}% of the command"
+    length = _number(numbers["episode_length"], 1)
+    return f"{first}, length {length}, episodes {numbers['episodes']:.0f}, falls {numbers['fell']:.0f}"
 
 
 def _clock(seconds: float) -> str:

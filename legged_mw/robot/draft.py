@@ -23,6 +23,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
+from legged_mw.robot.makers import Maker, find_maker
 from legged_mw.robot.measure import (
     Gains,
     Joint,
@@ -58,6 +59,7 @@ class Draft(NamedTuple):
     guessed: list[str]  # guessed values, one line each
     pose_from: str  # source of the default pose, as text
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
+    maker: Maker | None  # what its maker publishes, if that is known
 
 
 def draft(file: Path) -> Draft:
@@ -69,13 +71,19 @@ def draft(file: Path) -> Draft:
     pose = np.clip(robot.pose, *robot.joint_range.T)
     rest = stand_as_statue(robot, pose, place)
     feet = guess_feet(robot, rest.qpos)
-    bends = None if from_file else bent(robot, pose, feet)
+    maker = find_maker(file, robot.spec.modelname, robot.joint_names)
+    published = maker.of("pose", robot.joint_names) if maker and not from_file else {}
+    bends = None if from_file or published else bent(robot, pose, feet)
+    if published:
+        bends = np.array([published.get(name, angle) for name, angle in zip(robot.joint_names, pose, strict=True)])
+        bends = np.clip(bends, *robot.joint_range.T)
     if bends is not None:
         pose, rest = bends, stand_as_statue(robot, bends, place)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
     how = (
         "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
     )
+    how = f"its maker's, {maker.source}" if maker and published else how
     how = "the file's keyframe" if from_file else how
     pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
@@ -95,7 +103,7 @@ def draft(file: Path) -> Draft:
     ]
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more])
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker)
 
 
 def _firm(
