@@ -244,10 +244,13 @@ def damaged(root: Path, content: bytes | None) -> None:
     (root / "out/policy.onnx").write_bytes(content)
 
 
-def zipped(file: Path, *names: str) -> None:
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in names:
-            archive.writestr(name, "<mujoco/>")
+def zipped(*names: str, method: int = zipfile.ZIP_DEFLATED, text: str = "<mujoco/>") -> Run:
+    def write(file: Path) -> None:
+        with zipfile.ZipFile(file, "w", method) as archive:
+            for name in names:
+                archive.writestr(name, text)
+
+    return write
 
 
 def reads(root: Path) -> None:
@@ -372,13 +375,23 @@ def table() -> Table:
     )
     for name, write in {
         "of text": lambda file: file.write_bytes(b"PK"),
-        "of two files": lambda file: zipped(file, "model.xml", "terrain.xml"),
+        "of two files": zipped("model.xml", "terrain.xml"),
+        "of another file": zipped("terrain.xml"),
+        "of no file": zipped(),
+        "packed by LZMA": zipped("model.xml", method=zipfile.ZIP_LZMA),
+        "packed by bzip2": zipped("model.xml", method=zipfile.ZIP_BZIP2),
+        "that unpacks to more than there may be": zipped("model.xml", text=" " * (mjcf.MOST_BYTES + 1)),
         "that names another": lambda file: write_archive(file, '<mujoco><include file="other.xml"/></mujoco>'),
+        "that names a mesh": lambda file: write_archive(file, '<mujoco><asset><mesh file="m.obj"/></asset></mujoco>'),
     }.items():
         made.add(
             f"terrain {name}",
             lambda root: read_scene(root / "out", read_contract(root / "out", edited=True), "terrain.mjz"),
-            lambda root, write=write: (theirs("go1_rough")(root), write(root / "out/terrain.mjz")),
+            lambda root, write=write: (
+                theirs("go1_rough")(root),
+                write(root / "out/terrain.mjz"),
+                (root / "other.xml").write_text("<mujoco/>"),  # where a model of a text would look for it
+            ),
         )
     small = patched(in_scene_too, mjcf, MOST_BYTES=1000)
     made.add("scene: large", small, theirs("go1_flat"))
