@@ -126,6 +126,20 @@ def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
     assert found.shape == (2, 2) and found[:, 0].tolist() == [0.0, 0.0]
 
 
+def test_a_lookup_by_hand_at_the_rim_and_beyond() -> None:
+    """Squares of the vertices' numbers: no two neighbours differ alike, so a vertex beside the right one is seen."""
+    field = np.arange(12.0).reshape(3, 4) ** 2
+    nowhere = {"tile": 1.0, "kinds": (), "difficulties": (), "origins": np.zeros((0, 0, 3))}
+    look_up = HeightMap(Terrain(heights=field, cell=0.5, corner=(1.0, -2.0), **nowhere), "cpu")
+    column, row = np.meshgrid(np.arange(-2, 7), np.arange(-2, 6))
+    points = np.stack([1.0 + 0.5 * column, -2.0 + 0.5 * row], axis=-1)
+    expected = field[row.clip(0, 2), column.clip(0, 3)]
+    np.testing.assert_array_equal(look_up(torch.tensor(points, dtype=torch.float)), expected)
+    # in the last cell, of heights 36 49, 100 121: 3/4 across and 1/4 along, then the other way round
+    inside = torch.tensor([[2.375, -1.375], [2.125, -1.125], [torch.nan, torch.nan]])
+    assert look_up(inside).tolist() == [36 + 0.75 * 13 + 0.25 * 72, 36 + 0.75 * 64 + 0.25 * 21, 0.0]
+
+
 # ---- kinds of one's own
 
 

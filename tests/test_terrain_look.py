@@ -131,6 +131,7 @@ def test_a_plane_is_drawn_as_ever_and_rough_ground_in_tiles(hilly: mujoco.MjMode
     assert flat.nhfield == 0 and flat.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE and flat.geom_rgba[0, 3] == 1.0
     assert hilly.nhfield == 2 * 5 + 3, "each tile twice, but for level ones: two that are flat, and a slope of 0"
     assert len(shown(hilly)) == 8 and hilly.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
+    assert not hilly.geom("floor").size[:2].any() and not hilly.geom("floor").pos.any()  # without an end, for the haze
     robot = hilly.geom_bodyid > 0
     assert not hilly.geom_contype[~robot & (hilly.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)].any()
     assert (hilly.nq, hilly.nv) == (19, 18)

@@ -85,6 +85,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(name: str, tmp_path: Path) 
     assert result.code == 0 and EXACTLY in result.out, result
     assert_equal(load(killed / "model_3.pt"), load(whole / "model_3.pt"))
     resumed, uninterrupted = (load(folder / "worlds_3.pt") for folder in (killed, whole))
+    assert resumed["device"] == "cpu"
     resumed["worlds"] = {name: resumed["worlds"][name] for name in uninterrupted["worlds"]}  # loading wrote more
     assert_equal(resumed, uninterrupted)
 
