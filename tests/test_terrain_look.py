@@ -334,11 +334,6 @@ def test_names_do_not_run_into_each_other(
             ["a.png", "--task", "go1_flat"],
             "go1_flat is on a plane; to see its section terrain all the same add --set terrain.mesh_type=",
         ),
-        (["a.png", "--set", "terrain.num_rows=0"], "terrain.num_rows is 0; it must be 1 or more"),
-        (
-            ["a.png", "--set", "terrain.terrain_proportions={moon: 1}"],
-            "terrain.terrain_proportions: no kind of terrain 'moon' in the table of kinds",
-        ),
     ],
 )
 def test_mistakes_are_one_line(

@@ -275,6 +275,11 @@ def table() -> Table:
     for name, (task, fields) in {
         "a pull on another body": ("go1_getup", {"falls.pull_on": "nose"}),
         "a pull at the root": ("go1_getup", {"falls.pull": 0.5, "falls.pull_on": "", "perturbation.kick": True}),
+        "a share above 1": ("go1_getup", {"falls.share": 1.5}),
+        "no states": ("go1_getup", {"falls.states": 0}),
+        "a pull down": ("go1_getup", {"falls.pull": -1.0}),
+        "a nose to no side": ("go1_handstand", {"exam.nose": 0.0}),
+        "no hands": ("go1_handstand", {"exam.hands": []}),
         "hands that are not there": ("go1_handstand", {"exam.hands": ["nose"]}),
         "a command outside": ("go1_flat", {"commands.default": {"lin_vel_x": 9.0}}),
     }.items():
