@@ -15,7 +15,7 @@ import torch
 from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.terrain import build_terrain
-from legged_mw.sim.ground import as_boxes
+from legged_mw.sim.ground import Ground, add_ground, as_boxes, leaning, replace_level_pieces
 from legged_mw.sim.height_map import HeightMap
 from legged_mw.sim.terrain import (
     KINDS,
@@ -118,25 +118,40 @@ def test_columns_are_shared_out() -> None:
     assert share_columns({"flat": 100.0, "gap": 1.0, "waves": 0.0}, 5) == ("flat",) * 4 + ("gap",)
 
 
-@pytest.mark.parametrize("cell", [0.1, 0.05])
-def test_a_lookup_is_what_a_ray_hits(cell: float) -> None:
-    ground = terrain(levels=2, cell=cell)
-    low, high = ground.span()
-    rows, columns = ground.heights.shape
-    spec = mujoco.MjSpec()
-    size = [(columns - 1) * cell / 2, (rows - 1) * cell / 2, high - low, 1.0]
-    spec.add_hfield(
-        name="ground", size=size, nrow=rows, ncol=columns, userdata=((ground.heights - low) / (high - low)).ravel()
-    )
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=[0, 0, low])
+def drop_rays(spec: mujoco.MjSpec, points: np.ndarray) -> list[float]:
+    """Heights [m] that rays straight down hit at ``points`` (n, 2)."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    hit, down = np.zeros(1, dtype=np.int32), np.array([0.0, 0.0, -1.0])
+    return [5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), down, None, 1, -1, hit) for p in points]
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.05])
+def test_a_lookup_is_what_a_ray_hits(cell: float) -> None:
+    ground, spec = terrain(levels=2, cell=cell), mujoco.MjSpec()
+    add_ground(spec, Ground(terrain=ground), [])
     points = np.random.default_rng(0).uniform(ground.corner, [-c for c in ground.corner], (1000, 2))
-    hit = np.zeros(1, dtype=np.int32)
-    down = np.array([0.0, 0.0, -1.0])
-    rays = [5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), down, None, 1, -1, hit) for p in points]
+    rays = drop_rays(spec, points)
     np.testing.assert_allclose(HeightMap(ground, "cpu")(torch.tensor(points, dtype=torch.float)), rays, atol=1e-4)
+
+
+def test_a_ray_hits_boxes_where_the_vertices_are() -> None:
+    """Level pieces as boxes, the rest as a height field, for which few iterations become more."""
+    ground, spec = terrain(levels=2), mujoco.MjSpec()
+    spec.option.iterations, spec.option.ls_iterations = 1, 60
+    add_ground(spec, Ground(terrain=ground), [])
+    replace_level_pieces(spec, ground, [])
+    assert (spec.option.iterations, spec.option.ls_iterations) == (20, 60)
+    rng, (rows, columns) = np.random.default_rng(0), ground.heights.shape
+    row, column = rng.integers(0, rows, 1000), rng.integers(0, columns, 1000)
+    rays = drop_rays(spec, np.array(ground.corner) + 0.1 * np.column_stack([column, row]))
+    np.testing.assert_allclose(rays, ground.heights[row, column], atol=1e-4)
+
+
+def test_gravity_leans_ahead_on_a_slope() -> None:
+    """By 30 degrees: half of it along x, the root of 3/4 down."""
+    assert leaning([0.0, 0.0, -10.0], 30.0) == pytest.approx([5.0, 0.0, -10.0 * 0.75**0.5])
 
 
 def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
