@@ -10,7 +10,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from legged_mw.rl.rsl_rl_settings import network_section
+from legged_mw.rl.learner_config import network_section
 from legged_mw.rl.students.concurrent import ConcurrentModel
 from legged_mw.rl.students.estimator import EstimatingModel
 

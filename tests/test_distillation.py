@@ -12,7 +12,7 @@ from rsl_rl.algorithms import Distillation
 from rsl_rl.models import MLPModel
 
 from legged_mw.check.recordable import recordable
-from legged_mw.rl.rsl_rl_settings import network_section
+from legged_mw.rl.learner_config import network_section
 from legged_mw.rl.students.distillation import GraphedDistillation
 
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -30,7 +30,7 @@ from legged_mw.export.contract import contract_rows
 from legged_mw.export.exporter import FILES, Exported, ExportError, export
 from legged_mw.export.replay import overridden, own_ends
 from legged_mw.export.scene import differences, standalone
-from legged_mw.rl.rsl_rl_settings import actor_settings, network_section
+from legged_mw.rl.learner_config import actor_settings, network_section
 from legged_mw.rl.run_folder import update_from_run
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import load_yaml

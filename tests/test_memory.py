@@ -24,10 +24,9 @@ from legged_mw.eval import rough
 from legged_mw.eval.rollout import OVERRIDES, holding, roll_out
 from legged_mw.export import replay as export_replay
 from legged_mw.export.exporter import ExportError, export
-from legged_mw.rl.learner_config import fit_cpu
+from legged_mw.rl.learner_config import fit_cpu, rsl_rl_config
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.recurrent import forget, memory_of
 from legged_mw.rl.training import advice_on_rate

@@ -12,9 +12,9 @@ from learner import SIZES, collect, difference, make, parameters, share_experien
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 
-from legged_mw.rl.layers import Linear
+from legged_mw.rl.learner_config import rsl_rl_config
+from legged_mw.rl.networks import Linear
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.utils.task import load_task
 
 SYMMETRY = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from program import SMALL, refused, run, trained
 
+from legged_mw.rl.learner_config import ALLOWED, check_classes, rsl_rl_config
 from legged_mw.rl.policies import load_policy
-from legged_mw.rl.rsl_rl_settings import ALLOWED, check_classes, rsl_rl_config
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import load_task
 
@@ -166,12 +166,12 @@ def test_the_path_in_a_run_is_not_imported(home: Path) -> None:
 def test_every_allowed_class_is_one_that_rsl_rl_finds_under_that_name() -> None:
     from rsl_rl.utils import resolve_callable
 
-    from legged_mw.rl.rsl_rl_settings import spellings
+    from legged_mw.rl.learner_config import spellings
 
     for path, kinds in ALLOWED.items():
         for kind in kinds:
             for name in spellings(kind):
-                assert resolve_callable(name) is (resolve_callable(kind) if isinstance(kind, str) else kind)
+                assert resolve_callable(name) is resolve_callable(kind)
                 task = load_task("go1_flat")
                 if not path.startswith("critic.distribution"):  # a section that the critic has not
                     task.set(path, name)

@@ -29,7 +29,7 @@ from legged_mw.deploy.stage import DeployStage
 from legged_mw.export import exporter as exporting
 from legged_mw.export.exporter import Exported, export
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.rsl_rl_settings import mirror
+from legged_mw.rl.ppo import mirror
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError

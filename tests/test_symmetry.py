@@ -19,7 +19,8 @@ from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.rl.rsl_rl_settings import mirror, rsl_rl_config
+from legged_mw.rl.learner_config import rsl_rl_config
+from legged_mw.rl.ppo import mirror
 from legged_mw.rl.run_folder import update_from_run
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
@@ -122,6 +123,17 @@ def test_a_joint_may_have_a_partner_within_a_tolerance(tmp_path: Path) -> None:
     with pytest.raises(ModelError):
         find_partners(apart, tolerance=0.004)
     assert find_partners(apart, tolerance=0.006).joints[:6] == (3, 4, 5, 0, 1, 2)
+
+
+def test_the_axis_of_a_partner_may_be_tilted_a_little(tmp_path: Path) -> None:
+    joint = '<joint name="FL_calf_joint" class="calf"'
+    for tilt in (0.02, 0.008):  # [rad], beyond what is allowed and within it
+        tilted = load_robot(tmp_path / "go1.xml", replaced(GO1, joint, f'{joint} axis="{tilt} 1 0"', 1))
+        if tilt > 0.01:
+            with pytest.raises(ModelError):
+                find_partners(tilted)
+    assert find_partners(tilted).joints[:6] == (3, 4, 5, 0, 1, 2)
+    assert find_partners(tilted).signs[:6] == (-1, 1, 1, -1, 1, 1)
 
 
 # ---- observations and actions
@@ -415,7 +427,7 @@ def test_stock_ppo_learns_with_it(symmetry: dict[str, Any], tmp_path: Path) -> N
 
 def test_rsl_rl_reads_what_mirror_returns_as_it_is_meant(env: LeggedRobot) -> None:
     """Twice the batch, originals first; and the mirror loss is zero for a policy that does on the left what it does on the right."""
-    symmetry = Symmetry(env, "legged_mw.rl.rsl_rl_settings:mirror", use_data_augmentation=True)
+    symmetry = Symmetry(env, "legged_mw.rl.ppo:mirror", use_data_augmentation=True)
     obs = TensorDict({group: torch.randn(5, value.shape[1]) for group, value in env.obs_buf.items()}, batch_size=[5])
     numbers = torch.randn(5, 1)
     batch = RolloutStorage.Batch(

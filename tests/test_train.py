@@ -32,8 +32,8 @@ from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export.network import save_onnx
 from legged_mw.rl.iteration_log import console_rows, curves
+from legged_mw.rl.learner_config import rsl_rl_config
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.rsl_rl_settings import rsl_rl_config
 from legged_mw.rl.run_folder import checkpoints, find_checkpoint, find_run, new_run, runs
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.utils.config import ConfigError, load_yaml
@@ -415,7 +415,7 @@ KILLED = """
 import os, random, signal, sys, time
 from pathlib import Path
 import torch
-from legged_mw.rl.checkpoint import save_whole
+from legged_mw.rl.run_folder import save_whole
 
 torch.set_num_threads(1)
 folder, dice = Path(sys.argv[1]), random.Random(0)

@@ -12,11 +12,13 @@ from legged_mw.deploy import drive, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, edits, read_contract
 from legged_mw.deploy.drive import lift
 from legged_mw.deploy.exam import SwitchStage, contract_skill, run_exam, run_skill
+from legged_mw.deploy.hard_exam import run_hard
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import walking
+from legged_mw.eval.hard import table
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import check_folder, typed, writable
@@ -143,6 +145,7 @@ def parse() -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
+    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam, in a third of the time")
     parser.add_argument(
         "--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name"
     )
@@ -175,6 +178,8 @@ def parse() -> argparse.Namespace:
         parser.error(f"--switch is watched in simulation, on flat ground: leave {others[0]} out")
     if args.ranges and not args.eval:
         parser.error("--ranges says what the exam asks: add --eval")
+    if args.no_hard and not args.eval:
+        parser.error("--no_hard leaves a part of the exam out: add --eval")
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
     if args.out is not None:
@@ -219,6 +224,7 @@ def main() -> None:
             args.ranges == "common",
             contact,
             args.edited,
+            hard=not args.no_hard,
         )
     else:
         stage = DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact, edited=args.edited)
@@ -248,8 +254,18 @@ def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
     print(f"written to {shown(path.with_suffix('.png'))}")
 
 
-def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None, edited: bool = False) -> None:
-    """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage."""
+def examine(
+    folder: Path,
+    path: Path,
+    common: bool = False,
+    contact: str | None = None,
+    edited: bool = False,
+    hard: bool = True,
+) -> None:
+    """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage.
+
+    ``hard``: the hard exam too, of a policy that walks.
+    """
     contract = read_contract(folder, edited)
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
@@ -263,6 +279,10 @@ def examine(folder: Path, path: Path, common: bool = False, contact: str | None 
     else:
         result = run_exam(folder, common=common, contact=contact, edited=edited)
         print(walking.table(result))
+        if hard and contract.feet:
+            rules = walking.ExamRules.from_mapping(result["rules"])
+            result["hard"], _ = run_hard(folder, rules, result["walks"], edited)
+            print(f"\n{table(result['hard'])}")
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}
     try:

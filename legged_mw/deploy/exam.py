@@ -15,6 +15,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import CONTRACT_FILE, OWN, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.controller import Controller
+from legged_mw.deploy.hard_exam import run_hard, strip_png
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import walking
@@ -25,9 +26,15 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, unknown
 
 
-def run(folder: Path, exam: ExamRules | Skill) -> dict[str, Any]:
-    """Grade the export in ``folder`` by the rules ``exam``."""
-    return run_skill(folder, exam) if isinstance(exam, Skill) else run_exam(folder, exam)
+def run(folder: Path, exam: ExamRules | Skill, hard: bool = True) -> tuple[dict[str, Any], bytes]:
+    """Grade the export in ``folder`` by the rules ``exam``; a walk by the hard exam too, and a PNG of one stride."""
+    if isinstance(exam, Skill):
+        return run_skill(folder, exam), b""
+    result, contract = run_exam(folder, exam), read_contract(folder)
+    if not hard or not contract.feet:
+        return result, b""
+    result["hard"], poses = run_hard(folder, exam, result["walks"])
+    return result, strip_png(folder, contract, poses)
 
 
 def run_exam(

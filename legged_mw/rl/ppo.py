@@ -10,29 +10,43 @@ On a CPU the same code runs unrecorded. It prepares each minibatch once, not onc
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.extensions import Symmetry
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.envs.mirror import Columns
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.statistics import BOUND
-from legged_mw.rl.adam import FlatAdam, make_recordable, plain_state
-from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
-from legged_mw.rl.losses import own_std, policy_loss, value_loss
+from legged_mw.rl.learner_config import MAX_RATE
+from legged_mw.rl.networks import (
+    HalfWeights,
+    Memories,
+    RegressingModel,
+    RememberingModel,
+    Sequenced,
+    elu_layers,
+    kernels_for,
+    run_mlp,
+    sample,
+    sum_rows,
+    trained_parts,
+    update_normalizer,
+)
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
-_MIN_RATE, MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
+_MIN_RATE, _RATE_STEP = 1e-5, 1.5  # of the adaptive learning rate, as in rsl-rl
 
 
 class Recorded:
@@ -483,119 +497,6 @@ def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | N
         )
 
 
-# ---- networks that are more than an MLP -----------------------------------------------------------------------------
-
-
-# Inputs of a recurrent network in an update; only its memory knows the parts.
-Sequenced = tuple[Tensor, ...]
-
-
-class RegressingModel(MLPModel):
-    """rsl-rl's MLPModel whose input is, in part, the output of an ``estimator``, which learns by regression.
-
-    rl/students/ holds such networks. A learner knows none of them by name.
-    """
-
-    field: str  # the config field that selects the model
-    regression: str  # the name of the regression loss
-    estimator: nn.Module
-    learning_rate: float  # of the estimator
-
-    @staticmethod
-    def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-        """Constructor arguments beyond MLPModel's, see ``actor_settings``. Raises ConfigError."""
-        raise NotImplementedError
-
-    def rollout_latent(self, obs: TensorDict) -> Tensor:
-        """The MLP's input (N, size) during the rollout, of all worlds in order."""
-        return self.get_latent(obs)
-
-    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """Inputs and targets of the regression, the same in all epochs of an update.
-
-        ``obs`` (S * B,) come from ``worlds`` (B,); S is 2 if mirror images follow them, else 1.
-        """
-        raise NotImplementedError
-
-    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """The network's output for ``latent``, which may be padded with zeros, and the regression loss ().
-
-        The loss has no gradient for the parameters that the output depends on.
-        """
-        raise NotImplementedError
-
-    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
-        """Update the normaliser of the regression."""
-        raise NotImplementedError
-
-
-def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
-    """Parameters by part, of policy, critic and estimator if there is one, and the estimator's learning rate ().
-
-    The gradients of a part are clipped together.
-    """
-    if not isinstance(actor, RegressingModel):
-        return [[*actor.parameters()], [*critic.parameters()]], []
-    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
-    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
-    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
-
-
-class Memory(Protocol):
-    """The hidden state of a recurrent network in each of N worlds, in tensors that stay."""
-
-    now: Tensor  # (states, S, N, H): S is 2 if mirror images have a state of their own, else 1
-    start: Tensor  # the same at the start of the rollout
-
-    def advance(self, obs: Any) -> Tensor:
-        """Take in observations (N,), or (2N,) with their mirror images; returns the MLP's input (N, H)."""
-        ...
-
-    def normalised(self, obs: Any) -> Tensor:
-        """The recurrent layers' input (B, size) for observations (B,)."""
-        ...
-
-    def forget(self, ended: Tensor) -> None:
-        """Set the state to 0 where ``ended`` (N,)."""
-
-    def for_rsl_rl(self) -> Any:
-        """A copy of the state in rsl-rl's form."""
-
-    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequenced:
-        """The rollout of ``worlds`` (B,), from ``inputs`` (S * T * B, size) and ``dones`` (T, N, 1) after each step."""
-        ...
-
-    def unroll(self, sequence: Sequenced) -> Tensor:
-        """The MLP's inputs (S * T * B, H) over a sequence, with gradients."""
-        ...
-
-
-class RememberingModel(RNNModel):
-    """rsl-rl's recurrent network; a recorded learner keeps its hidden state."""
-
-    def memory(self, worlds: int, images: int, device: str) -> Memory:
-        """An empty memory; with ``images`` 2 it has a second state, which has seen mirror images only."""
-        raise NotImplementedError
-
-
-class Memories(dict[nn.Module, Memory]):
-    """Network -> memory, of the recurrent networks among ``models``."""
-
-    def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
-        remembering = [model for model in models if isinstance(model, RememberingModel)]
-        super().__init__({model: model.memory(worlds, images, device) for model in remembering})
-
-    def begin_rollout(self) -> None:
-        """Keep the present states as the start of the rollout."""
-        for memory in self.values():
-            memory.start.copy_(memory.now)
-
-    def forget(self, ended: Tensor) -> None:
-        """Set all states to 0 where ``ended`` (N,)."""
-        for memory in self.values():
-            memory.forget(ended)
-
-
 # ---- the rollback of an update --------------------------------------------------------------------------------------
 
 
@@ -679,3 +580,214 @@ def _beyond(values: Tensor) -> Tensor:
     """(C,) True for the columns of ``values`` (B, C) with a value that is not finite, or beyond BOUND."""
     low, high = torch.aminmax(values, dim=0)
     return ~((low >= -BOUND) & (high <= BOUND))
+
+
+# ---- losses ---------------------------------------------------------------------------------------------------------
+#
+# Of a Gaussian policy, as in rsl-rl, with their gradients with respect to the networks' outputs. The formulas stand here
+# once, and autograd differentiates them. On a GPU a kernel computes each with its gradient (fast/kernels.py), and tests
+# hold the kernels to the formulas. Tensors are of B samples; mirror images come last.
+
+
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+class PolicyLoss(NamedTuple):
+    """Terms of the actor's loss (), and its gradients."""
+
+    of_mean: Tensor  # (B, A)
+    of_std: Tensor  # shaped as the std
+    surrogate: Tensor
+    entropy: Tensor
+    kl: Tensor  # divergence from the policy of the rollout
+
+
+def own_std(distribution: GaussianDistribution) -> Tensor:
+    """The std (A,) of a policy that has one for all states, else (B, A)."""
+    if type(distribution) is not GaussianDistribution:
+        return distribution.std
+    log = distribution.std_type == "log"
+    own = distribution.log_std_param if log else distribution.std_param
+    low, high = distribution.log_std_range if log else distribution.std_range
+    std = nn.functional.hardtanh(own, min_val=low, max_val=high)  # a clamp whose gradient is one kernel, not five
+    return std.exp() if log else std
+
+
+@torch.no_grad()
+def policy_loss(
+    mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float, entropy_coef: Tensor
+) -> PolicyLoss:
+    """PPO's clipped surrogate loss less ``entropy_coef`` times the entropy. Entropy and KL leave out mirror images."""
+    assert batch.old_distribution_params is not None
+    kernels, old = kernels_for(mean), batch.old_distribution_params
+    if kernels and std.dim() == 1:
+        (rows, width), of_mean, of_std, parts = (
+            mean.shape,
+            torch.empty_like(mean),
+            torch.empty_like(std),
+            mean.new_empty(3),
+        )
+        terms = mean.new_empty(rows, width + 2)
+        samples = batch.actions, batch.advantages, batch.old_actions_log_prob, *old
+        kernels.launch(kernels.policy_loss, rows, mean, std, *samples, clip, of_mean, terms)
+        kernels.launch(kernels.policy_sums, 1, sum_rows(terms), std, entropy_coef, rows, len(old[0]), of_std, parts)
+        return PolicyLoss(of_mean, of_std, *parts.unbind())
+    size, advantages, (old_mean, old_std) = len(old[0]), batch.advantages, old
+    with torch.enable_grad():
+        mean, std = mean.detach().requires_grad_(), std.detach().requires_grad_()
+        z = (batch.actions - mean) / std  # type: ignore[operator]
+        log_prob = -(0.5 * z.square() + std.log() + _HALF_LOG_2PI).sum(dim=-1, keepdim=True)
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob)  # type: ignore[operator]
+        clipped_ratio = ratio.clamp(1.0 - clip, 1.0 + clip)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()  # type: ignore[operator]
+        own = std[:size] if std.dim() == 2 else std
+        entropy = (own.log() + 0.5 + _HALF_LOG_2PI).sum(dim=-1).mean()
+        of_mean, of_std = torch.autograd.grad(surrogate - entropy_coef * entropy, (mean, std))
+    ratio_of_std, moved = old_std / own, (old_mean - mean[:size]) / own
+    kl = (0.5 * (ratio_of_std.square() + moved.square() - 1.0) - ratio_of_std.log()).sum(dim=-1).mean()
+    return PolicyLoss(of_mean, of_std, surrogate.detach(), entropy.detach(), kl)
+
+
+@torch.no_grad()
+def value_loss(values: Tensor, batch: RolloutStorage.Batch, clip: float, coef: float) -> tuple[Tensor, Tensor]:
+    """The gradient (B, 1) of ``coef`` times the value loss, and the value loss (); clipped, unless ``clip`` is 0."""
+    if kernels := kernels_for(values):
+        of_values, terms = torch.empty_like(values), torch.empty_like(values)
+        kernels.launch(
+            kernels.value_loss, len(values), values, batch.values, batch.returns, clip, coef, of_values, terms
+        )
+        return of_values, terms.mean()
+    with torch.enable_grad():
+        values = values.detach().requires_grad_()
+        losses = (values - batch.returns).square()  # type: ignore[operator]
+        if clip:
+            near = batch.values + (values - batch.values).clamp(-clip, clip)  # type: ignore[operator]
+            losses = torch.max(losses, (near - batch.returns).square())  # type: ignore[operator]
+        loss = losses.mean()
+        (of_values,) = torch.autograd.grad(coef * loss, values)
+    return of_values, loss.detach()
+
+
+# ---- Adam -----------------------------------------------------------------------------------------------------------
+#
+# Adam that a CUDA graph can record, with all parameters in one tensor, and its state in rsl-rl's form. A CPU runs its
+# formulas as they stand here. On a GPU two kernels compute them (fast/kernels.py), and tests hold the kernels to the
+# formulas, and the formulas to torch's own Adam.
+
+
+_ALIGNED = 64  # values: fast matrix products want each parameter to begin at a multiple
+
+
+def make_recordable(optimizer: torch.optim.Optimizer, rates: Sequence[Tensor | float], device: str) -> None:
+    """Make an Adam, new or loaded, one that can be recorded, with a learning rate for each of its groups."""
+    for group, rate in zip(optimizer.param_groups, rates, strict=True):
+        group.update(lr=rate, fused=True, capturable=device.startswith("cuda"))
+    for memory in optimizer.state.values():
+        memory["step"] = memory["step"].to(device, torch.float32)
+
+
+def plain_state(state: dict[str, Any], rates: Sequence[float]) -> dict[str, Any]:
+    """The state of such an Adam in rsl-rl's form: a count of steps for each parameter."""
+    plain = {"fused": None, "capturable": False}
+    return {
+        "state": {i: {**memory, "step": memory["step"].cpu().clone()} for i, memory in state["state"].items()},
+        "param_groups": [
+            {**group, "lr": rate, **plain} for group, rate in zip(state["param_groups"], rates, strict=True)
+        ],
+    }
+
+
+class FlatAdam:
+    """Clips and steps a ``part`` of the parameters of an Adam or AdamW, all of them in one tensor.
+
+    Parameters and Adam's moments become views of flat tensors; the optimizer's state holds the views.
+    """
+
+    def __init__(
+        self, optimizer: torch.optim.Optimizer, group: int, part: Sequence[nn.Parameter], limit: float
+    ) -> None:
+        """``group``: the part's group in the optimizer; ``limit`` on the norm of its gradient."""
+        self._optimizer, self._group, self._limit = optimizer, optimizer.param_groups[group], limit
+        self._part = [parameter for parameter in part if parameter.requires_grad]
+        first = self._part[0].detach()
+        self._gaps = [first.new_zeros(-parameter.numel() % _ALIGNED) for parameter in self._part]
+        self._values = self._lay([parameter.detach() for parameter in self._part])
+        self._memory = [torch.zeros_like(self._values) for _ in range(2)]
+        self._step = torch.zeros((), dtype=torch.float32, device=first.device)
+        self._factors = first.new_zeros(4)
+        for parameter, value in zip(self._part, self._views(self._values), strict=True):
+            parameter.data = value
+
+    def _lay(self, tensors: Sequence[Tensor]) -> Tensor:
+        return torch.cat(
+            [piece for pair in zip(tensors, self._gaps, strict=True) for piece in (pair[0].flatten(), pair[1])]
+        )
+
+    def _views(self, flat: Tensor) -> list[Tensor]:
+        sizes = [
+            size for value, gap in zip(self._part, self._gaps, strict=True) for size in (value.numel(), gap.numel())
+        ]
+        return [piece.view_as(value) for piece, value in zip(flat.split(sizes)[::2], self._part, strict=True)]
+
+    def gradient(self) -> Tensor | None:
+        """The part's gradients in one tensor, or None."""
+        if all(parameter.grad is None for parameter in self._part):
+            return None
+        return self._lay([torch.zeros_like(value) if value.grad is None else value.grad for value in self._part])
+
+    def _take_over(self) -> None:
+        """Copy the optimizer's state, new or loaded, into the flat tensors, and make it views of them."""
+        states = [self._optimizer.state[parameter] for parameter in self._part]
+        if states[0].get("step") is self._step:
+            return
+        for key, flat in zip(("exp_avg", "exp_avg_sq"), self._memory, strict=True):
+            for state, view in zip(states, self._views(flat), strict=True):
+                view.copy_(state[key]) if key in state else view.zero_()
+                state[key] = view
+        self._step.copy_(states[0]["step"]) if "step" in states[0] else self._step.zero_()
+        for state in states:
+            state["step"] = self._step
+
+    @torch.no_grad()
+    def step(self, gradient: Tensor) -> None:
+        """One step along ``gradient``, at the group's rate."""
+        self._take_over()
+        group, (mean, square), norm = self._group, self._memory, torch.linalg.vector_norm(gradient)
+        rate, (beta1, beta2), eps, decay = (group[name] for name in ("lr", "betas", "eps", "weight_decay"))
+        if kernels := kernels_for(gradient):
+            kernels.launch(
+                kernels.begin_adam, 1, norm, self._limit, rate, beta1, beta2, decay, self._step, self._factors
+            )
+            kernels.launch(
+                kernels.adam, len(gradient), gradient, self._factors, beta1, beta2, eps, self._values, mean, square
+            )
+            return
+        self._step += 1
+        count = self._step.double()
+        gradient = gradient * (self._limit / (norm + 1e-6)).clamp(max=1.0)
+        mean.lerp_(gradient, 1.0 - beta1)
+        square.mul_(beta2).addcmul_(gradient, gradient, value=1.0 - beta2)
+        divisor = (square / (1.0 - beta2**count)).sqrt_().add_(eps)
+        self._values.mul_(1.0 - rate.double() * decay).sub_(mean / divisor * (rate / (1.0 - beta1**count)))
+
+
+# ---- mirror images --------------------------------------------------------------------------------------------------
+
+
+def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
+    """rsl-rl's ``data_augmentation_func``: the observations and actions of B samples, then of their mirror images.
+
+    Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024.
+
+    ``obs`` may hold any of the environment's groups. A CUDA graph can record it: no read from the device. Look
+    at ``env.mirror`` before recording, as its first use makes tensors.
+    """
+    table = env.mirror
+    if obs is not None:
+        groups = {name: _with_image(value, table.observations[name]) for name, value in obs.to_dict().items()}
+        obs = TensorDict(groups, batch_size=[2 * obs.batch_size[0]], device=obs.device)
+    return obs, None if actions is None else _with_image(actions, table.actions)
+
+
+def _with_image(x: Tensor, columns: Columns) -> Tensor:
+    return torch.cat([x, columns(x)])

@@ -35,6 +35,7 @@ from legged_mw.robot.measure import (
     suggest,
     what_joints_bear,
 )
+from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -69,6 +70,7 @@ class Draft(NamedTuple):
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
     maker: Maker | None  # what its maker publishes, if that is known
     gains_from: str  # source of the gains, as text
+    judged: list[Judged]  # the poses that were judged, the chosen one first
     simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
 
 
@@ -78,23 +80,16 @@ def draft(file: Path, simple: bool = False) -> Draft:
     from_file = read.keyframe is not None
     env = _bare(file, from_file)
     robot, place = env.robot, np.array(env.start_place)
-    pose = np.clip(robot.pose, *robot.joint_range.T)
-    rest = stand_as_statue(robot, pose, place)
+    rest = stand_as_statue(robot, np.clip(robot.pose, *robot.joint_range.T), place)
     feet = guess_feet(robot, rest.qpos)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
-    published = maker.of("pose", robot.joint_names) if maker and not from_file else {}
-    bends = None if from_file or published else bent(robot, pose, feet)
-    if published:
-        bends = np.array([published.get(name, angle) for name, angle in zip(robot.joint_names, pose, strict=True)])
-        bends = np.clip(bends, *robot.joint_range.T)
-    if bends is not None:
-        pose, rest = bends, stand_as_statue(robot, bends, place)
+    neutral = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
+    judged = judge_poses(robot, neutral, feet, maker, from_file)
+    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T)
+    rest = stand_as_statue(robot, pose, place)
+    feet = guess_feet(robot, rest.qpos)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
-    how = (
-        "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
-    )
-    how = f"its maker's, {maker.source}" if maker and published else how
-    how = "the file's keyframe" if from_file else how
+    how = ", ".join(filter(None, (judged[0].candidate.name, judged[0].candidate.source)))
     pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
@@ -105,13 +100,14 @@ def draft(file: Path, simple: bool = False) -> Draft:
         )
     gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [
-        f"pose: {how}",
+        f"pose: {how}{', though: ' * bool(judged[0].faults)}{'; '.join(judged[0].faults)}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         f"gains: {gains_from}",
     ]
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker, gains_from, simple)
+    notes = [*read.notes, *more]
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple)
 
 
 def _servos(
@@ -354,6 +350,17 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     return [_foot(robot, body, soles[body]) for body in sorted(soles)]
 
 
+def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
+    """Raise ModelError if the file's mesh of a low end of a limb cannot be read: it may be a foot."""
+    model, data = robot.physics, posed(robot.physics, qpos[7:], qpos[:7])
+    low = min(float(data.geom_xpos[robot.id("geom", geom), 2]) for foot in feet for geom in foot.geoms)
+    for body in {*range(1, model.nbody)} - {*model.body_parentid}:
+        name = model.body(body).name
+        is_low = data.xpos[body, 2] < 0.5 * (low + float(qpos[2]))
+        if name in robot.names.lost and not robot.names.bodies[name] and is_low:
+            raise ModelError(robot.names.lost[name])
+
+
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
     """The sole of a body: its lowest geom, and geoms of that type at about that height.
 
@@ -373,43 +380,11 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
 
 
-# ---- the pose of a file without one: bent knees, each foot under its hip, level soles
+# ---- weights of the pose reward
 
-# Ours: knee angle [rad] about the axis to the left, by number of feet. A quadruped leans its thighs back (Go1 0.9 and
-# -1.8), a biped forwards.
-KNEE = {2: 0.6}
-KNEE_ELSE = -1.6
-# weights of the pose on two feet, from configs/robots/g1.py; of arms and waist as of its waist, so that they are quiet
+# from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
 WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
 KNEE_WALKS = 0.1  # on more feet, where all other joints have 1 [MuJoCo Playground]
-_SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
-_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
-_MARGIN = 0.05  # [rad] distance to the limits of a joint
-
-
-def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
-    """``pose`` (D,) with all legs bent; None if a leg has fewer than two sideways joints.
-
-    A straight leg cannot push, and its servos have no preferred direction to bend. The first two joints of a leg about
-    the sideways axis are assumed to be hip and knee, and the leg to be straight with both at 0. A third one, the ankle,
-    keeps the sole level.
-    """
-    model, found = robot.physics, pose.copy()
-    data = posed(model, pose)
-    for foot in feet:
-        legs = [joint for joint in _joints_to(model, foot) if abs(data.xaxis[joint][1]) > _SIDEWAYS]
-        if len(legs) < 2:
-            return None
-        hip, knee, *ankle = legs
-        turn = KNEE.get(len(feet)) or KNEE_ELSE * _forward(data, model, knee, foot)
-        signs = np.sign(data.xaxis[legs, 1])
-        angles = [_within(model, knee, sign * turn * signs[1]) for sign in (1.0, -1.0)]
-        found[knee - 1] = max(angles, key=abs) if abs(angles[0]) < 0.5 * abs(turn) else angles[0]
-        found[hip - 1] = _over(model, found, hip, foot)
-        for joint, sign in zip(ankle[:1], signs[2:], strict=False):
-            leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
-            found[joint - 1] = _within(model, joint, -sign * leaning)
-    return found
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
@@ -417,8 +392,8 @@ def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot])
     model, data = robot.physics, posed(robot.physics, pose)
     weights = [QUIET if len(feet) == 2 else 1.0] * len(robot.joint_names)
     for foot in feet:
-        legs = _joints_to(model, foot)
-        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        legs = joints_to(model, foot)
+        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
         if len(feet) != 2:
             for joint in sideways[1:2]:
                 weights[joint - 1] = KNEE_WALKS
@@ -430,42 +405,3 @@ def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot])
         for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
             weights[joint - 1] = ANKLE
     return weights
-
-
-def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:
-    """The direction of the knee: 1.0 if the foot of the straight leg is below or ahead of the knee, -1.0 if behind."""
-    ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
-    return -1.0 if ahead < -_BEHIND else 1.0
-
-
-def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
-    """The joints from the root to the foot, without the root joint."""
-    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
-    while body:
-        first = int(model.body_jntadr[body])
-        joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
-        body = int(model.body_parentid[body])
-    return sorted(joints)
-
-
-def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
-    """The nearest angle within the joint's limits."""
-    if not model.jnt_limited[joint]:
-        return float(angle)
-    low, high = model.jnt_range[joint]
-    margin = min(_MARGIN, 0.25 * (high - low))
-    return float(np.clip(angle, low + margin, high - margin))
-
-
-def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot) -> float:
-    """The hip angle [rad] at which the foot is under the hip: the best of 200 angles within 90 deg."""
-    geoms = [model.geom(name).id for name in foot.geoms]
-    off = {}
-    for angle in np.linspace(-1.57, 1.57, 200):
-        trial = pose.copy()
-        trial[hip - 1] = allowed = _within(model, hip, angle)
-        data = posed(model, trial)
-        middle = data.geom_xpos[geoms].mean(axis=0)
-        away = middle - data.xanchor[hip]
-        off[allowed] = abs(float(away[0])) + (10.0 if away[2] > 0.0 else 0.0)
-    return round(min(off, key=lambda angle: off[angle]), 2)

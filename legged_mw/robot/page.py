@@ -44,11 +44,19 @@ _HEAD = (
 )
 
 
-def page(health: RobotNumbers, title: str, guessed: Sequence[str] = (), changed: Sequence[str] = ()) -> str:
-    """The whole page. ``guessed``: lines about guessed values. ``changed``: lines about changes to the robot's file."""
+def page(
+    health: RobotNumbers,
+    title: str,
+    guessed: Sequence[str] = (),
+    changed: Sequence[str] = (),
+    poses: Sequence[str] = (),
+) -> str:
+    """The whole page, with lines about guessed values, changes to the robot's file, and poses that were judged."""
     gains = suggest(health.joints, health.moment)
     lines = [f"health of {title}", *(f"  guessed: {line}" for line in guessed), *_summary(health)]
     lines += ["joints", *_table(health, gains), *_LEGEND]
+    if poses:
+        lines += ["poses that were judged", *(f"  {line}" for line in poses)]
     if changed:
         lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in changed)]
     found = [*faults(health), *doubtful(health, gains)]

@@ -10,8 +10,8 @@ import torch
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval.exams import make_exam
-from legged_mw.rl.layers import kernels_for
 from legged_mw.rl.learner_config import fit_cpu
+from legged_mw.rl.networks import kernels_for
 from legged_mw.rl.runner import make_runner
 from legged_mw.sim.device import device_facts
 from legged_mw.utils.cli import Parser, pick_device

@@ -22,8 +22,7 @@ from legged_mw.envs.observations import Observations
 from legged_mw.envs.statistics import NonFinite
 from legged_mw.rl import ppo
 from legged_mw.rl.iteration_log import FiniteCheck
-from legged_mw.rl.losses import value_loss
-from legged_mw.rl.ppo import GraphedPPO, UpdateRollback
+from legged_mw.rl.ppo import GraphedPPO, UpdateRollback, value_loss
 from legged_mw.rl.run_folder import checkpoints
 from legged_mw.rl.runner import Runner
 

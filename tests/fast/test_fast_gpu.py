@@ -11,7 +11,7 @@ from test_ppo import VARIANTS, update
 from legged_mw.fast import contact_count, quick_start
 from legged_mw.fast import skip_kernels as shortcuts
 from legged_mw.fast.fused import Fused
-from legged_mw.rl import layers
+from legged_mw.rl import networks
 from legged_mw.rl.ppo import GraphedPPO
 
 pytestmark = pytest.mark.gpu
@@ -76,7 +76,7 @@ def test_kernels_of_the_update_are_torchs_own(settings: dict, half: bool, monkey
     collect(plain, DEVICE)
     share_experience(plain, fused)
     before, got = parameters(plain), update(fused)
-    monkeypatch.setattr(layers, "FUSED_ON", [])
+    monkeypatch.setattr(networks, "FUSED_ON", [])
     assert got == pytest.approx(update(plain), rel=0.05 if half else 1e-3, abs=2e-3 if half else 1e-5)
     if half:  # a product's last bits turn Adam's first steps of weights whose gradients are near 0, whatever the rate
         assert apart(before, plain, fused) < 0.15

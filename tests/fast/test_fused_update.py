@@ -11,15 +11,15 @@ from learner import collect, difference, make, parameters, share_experience
 from rsl_rl.modules import MLP
 from test_ppo import SYMMETRY, update
 
-from legged_mw.rl import layers
-from legged_mw.rl.layers import HalfWeights, elu_layers, run_mlp
+from legged_mw.rl import networks
+from legged_mw.rl.networks import HalfWeights, elu_layers, run_mlp
 from legged_mw.rl.ppo import GraphedPPO
 
 
 @pytest.fixture
 def fused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The kernels that a GPU uses, compiled for the CPU."""
-    monkeypatch.setattr(layers, "FUSED_ON", ["cpu"])
+    monkeypatch.setattr(networks, "FUSED_ON", ["cpu"])
 
 
 def flat(gradients: Any) -> torch.Tensor:
@@ -56,9 +56,9 @@ def test_fused_update_is_torchs_own(variant: str, half: bool, monkeypatch: pytes
     for seed in range(2):
         collect(plain, seed=seed)
         share_experience(plain, fused)
-        monkeypatch.setattr(layers, "FUSED_ON", [])
+        monkeypatch.setattr(networks, "FUSED_ON", [])
         expected = update(plain)
-        monkeypatch.setattr(layers, "FUSED_ON", ["cpu"])
+        monkeypatch.setattr(networks, "FUSED_ON", ["cpu"])
         got = update(fused)
         # one bit of bfloat16 is 0.004
         assert difference(parameters(plain), parameters(fused)) < (0.05 if half else 1e-4)
@@ -80,7 +80,7 @@ def test_what_is_not_finite_stays_so(fused: None) -> None:
 @pytest.mark.parametrize("rows", [192, 7])
 def test_elu_layers_are_torchs_own(rows: int, kernels: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Output and all gradients, of inputs too; in bfloat16 to its rounding."""
-    monkeypatch.setattr(layers, "FUSED_ON", kernels)
+    monkeypatch.setattr(networks, "FUSED_ON", kernels)
     torch.manual_seed(0)
     net, x, seed = MLP(5, 3, [32, 16], "elu"), torch.randn(rows, 5, requires_grad=True), torch.randn(rows, 3)
     expected = net(x)

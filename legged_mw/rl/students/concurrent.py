@@ -20,8 +20,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.ppo import RegressingModel
+from legged_mw.rl.networks import RegressingModel, run_mlp, update_normalizer
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 

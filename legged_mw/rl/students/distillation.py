@@ -15,9 +15,8 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import make_recordable
-from legged_mw.rl.layers import run_mlp, sample, update_normalizer
-from legged_mw.rl.ppo import Memories, Recorded, UpdateRollback, why_stock
+from legged_mw.rl.networks import Memories, run_mlp, sample, update_normalizer
+from legged_mw.rl.ppo import Recorded, UpdateRollback, make_recordable, why_stock
 from legged_mw.rl.students.recurrent import step
 from legged_mw.sim.graph import StepGraph
 

@@ -17,9 +17,8 @@ from torch import Tensor, nn
 
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.layers import run_mlp, update_normalizer
+from legged_mw.rl.networks import RegressingModel, run_mlp, update_normalizer
 from legged_mw.rl.policies import ESTIMATE
-from legged_mw.rl.ppo import RegressingModel
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 

@@ -16,9 +16,8 @@ import torch
 from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
-from legged_mw.rl.layers import Linear, sum_rows
+from legged_mw.rl.networks import Linear, RememberingModel, Sequenced, sum_rows
 from legged_mw.rl.policies import MEMORY_INPUT, MEMORY_OUTPUT
-from legged_mw.rl.ppo import RememberingModel, Sequenced
 
 
 class SequenceInput(NamedTuple):

@@ -1,15 +1,21 @@
-"""Network layers for the recorded update: the same values and gradients as torch's own, in fewer and larger kernels."""
+"""The networks of a recorded learner: its layers, and what stands beside an MLP, a regression or a memory.
+
+Layers have the same values and gradients as torch's own, in fewer and larger kernels.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, Protocol
 
 import torch
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules import EmpiricalNormalization
+from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.utils.opaque import fast
 
 Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each
@@ -216,3 +222,116 @@ def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size:
     normalizer._mean += rate * delta
     normalizer._var += rate * (var - normalizer._var + delta * (mean - normalizer._mean))
     normalizer._std.copy_(normalizer._var.sqrt())
+
+
+# ---- networks that are more than an MLP -----------------------------------------------------------------------------
+
+
+# Inputs of a recurrent network in an update; only its memory knows the parts.
+Sequenced = tuple[Tensor, ...]
+
+
+class RegressingModel(MLPModel):
+    """rsl-rl's MLPModel whose input is, in part, the output of an ``estimator``, which learns by regression.
+
+    rl/students/ holds such networks. A learner knows none of them by name.
+    """
+
+    field: str  # the config field that selects the model
+    regression: str  # the name of the regression loss
+    estimator: nn.Module
+    learning_rate: float  # of the estimator
+
+    @staticmethod
+    def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+        """Constructor arguments beyond MLPModel's, see ``actor_settings``. Raises ConfigError."""
+        raise NotImplementedError
+
+    def rollout_latent(self, obs: TensorDict) -> Tensor:
+        """The MLP's input (N, size) during the rollout, of all worlds in order."""
+        return self.get_latent(obs)
+
+    def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """Inputs and targets of the regression, the same in all epochs of an update.
+
+        ``obs`` (S * B,) come from ``worlds`` (B,); S is 2 if mirror images follow them, else 1.
+        """
+        raise NotImplementedError
+
+    def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The network's output for ``latent``, which may be padded with zeros, and the regression loss ().
+
+        The loss has no gradient for the parameters that the output depends on.
+        """
+        raise NotImplementedError
+
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
+        """Update the normaliser of the regression."""
+        raise NotImplementedError
+
+
+def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
+    """Parameters by part, of policy, critic and estimator if there is one, and the estimator's learning rate ().
+
+    The gradients of a part are clipped together.
+    """
+    if not isinstance(actor, RegressingModel):
+        return [[*actor.parameters()], [*critic.parameters()]], []
+    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
+    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
+    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
+
+
+class Memory(Protocol):
+    """The hidden state of a recurrent network in each of N worlds, in tensors that stay."""
+
+    now: Tensor  # (states, S, N, H): S is 2 if mirror images have a state of their own, else 1
+    start: Tensor  # the same at the start of the rollout
+
+    def advance(self, obs: Any) -> Tensor:
+        """Take in observations (N,), or (2N,) with their mirror images; returns the MLP's input (N, H)."""
+        ...
+
+    def normalised(self, obs: Any) -> Tensor:
+        """The recurrent layers' input (B, size) for observations (B,)."""
+        ...
+
+    def forget(self, ended: Tensor) -> None:
+        """Set the state to 0 where ``ended`` (N,)."""
+
+    def for_rsl_rl(self) -> Any:
+        """A copy of the state in rsl-rl's form."""
+
+    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequenced:
+        """The rollout of ``worlds`` (B,), from ``inputs`` (S * T * B, size) and ``dones`` (T, N, 1) after each step."""
+        ...
+
+    def unroll(self, sequence: Sequenced) -> Tensor:
+        """The MLP's inputs (S * T * B, H) over a sequence, with gradients."""
+        ...
+
+
+class RememberingModel(RNNModel):
+    """rsl-rl's recurrent network; a recorded learner keeps its hidden state."""
+
+    def memory(self, worlds: int, images: int, device: str) -> Memory:
+        """An empty memory; with ``images`` 2 it has a second state, which has seen mirror images only."""
+        raise NotImplementedError
+
+
+class Memories(dict[nn.Module, Memory]):
+    """Network -> memory, of the recurrent networks among ``models``."""
+
+    def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
+        remembering = [model for model in models if isinstance(model, RememberingModel)]
+        super().__init__({model: model.memory(worlds, images, device) for model in remembering})
+
+    def begin_rollout(self) -> None:
+        """Keep the present states as the start of the rollout."""
+        for memory in self.values():
+            memory.start.copy_(memory.now)
+
+    def forget(self, ended: Tensor) -> None:
+        """Set all states to 0 where ``ended`` (N,)."""
+        for memory in self.values():
+            memory.forget(ended)
