@@ -171,6 +171,17 @@ def parse() -> argparse.Namespace:
     args = parser.parse_args()
     if args.folder is None and args.replay is None:
         parser.error("the following arguments are required: DIR")
+    _refuse(parser, args)
+    if args.out is not None:
+        writable(args.out, "--out")
+    launch.check_flags(args)
+    check_flags(args)
+    drive.check_flags(args)
+    return args
+
+
+def _refuse(parser: Parser, args: argparse.Namespace) -> None:
+    """Refuse flags of the exam, of a scene and of two policies that do not go together."""
     if args.eval and (
         asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
     ):
@@ -189,12 +200,6 @@ def parse() -> argparse.Namespace:
         parser.error("--no_hard leaves a part of the exam out: add --eval")
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
-    if args.out is not None:
-        writable(args.out, "--out")
-    launch.check_flags(args)
-    check_flags(args)
-    drive.check_flags(args)
-    return args
 
 
 def main() -> None:
