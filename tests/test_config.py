@@ -767,13 +767,12 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
     assert load_task("go1_flat").cfg.noise.level == 1.0  # by name it is the package's own
 
 
-def test_another_packages_name_configs_is_given_back(
-    no_configs: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_packages_name_configs_is_given_back(no_configs: None, tmp_path: Path) -> None:
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/__init__.py").write_text("")
     (tmp_path / "configs/mine.py").write_text("VALUE = 3\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.path.insert(0, str(tmp_path))  # of no_configs; syspath_prepend would restore that list, not the real one
+    importlib.invalidate_caches()
     first = load_task("go1_flat_dr")  # before anybody imported it
     mine = importlib.import_module("configs.mine")
     assert mine.VALUE == 3

@@ -23,13 +23,12 @@ from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, ContractRow, Ends, read_contract
+from legged_mw.deploy.contract import Contract, ContractRow, Ends, checksum, read_contract, sealed
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.exam import contract_rules
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.deploy.seal import checksum, sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rollout, walking

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_sim import build_toy, toy
 
+from legged_mw.robot.draft import draft
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import read_file
 
@@ -114,3 +115,31 @@ def test_a_robot_of_bodies_without_a_geom_is_read(tmp_path: Path) -> None:
     file.write_text(f'<mujoco><worldbody><body name="base">{inertial}<freejoint/></body></worldbody></mujoco>')
     with pytest.raises(ValueError, match="no hinge"):
         read_file(file)
+
+
+# ---- a mesh that is not there
+
+
+MESH = '<collision><geometry><mesh filename="package://there/torso.STL"/></geometry></collision>'
+
+
+@pytest.mark.parametrize("kind", ["URDF", "MJCF"])
+def test_a_missing_mesh_that_is_no_collider_of_the_task_is_a_note(kind: str, tmp_path: Path) -> None:
+    """G1 12 of unitree_rl_gym: its feet collide, its torso's mesh is missing in a mirror."""
+    if kind == "URDF":
+        file = urdf(tmp_path, base=MESH)
+        feet, found = ["left_leg", "right_leg"], draft(file)
+        assert [foot.name for foot in found.feet] == feet
+        choices = {"velocity_sites": [], "imu_site": ""}
+    else:
+        mesh = '<geom name="hull" type="mesh" mesh="torso" mass="0"/>'
+        file = toy(tmp_path, inside=mesh, extra='<asset><mesh name="torso" file="torso.STL"/></asset>')
+        feet, choices = ["left_foot", "right_foot"], {}
+    robot = build_toy(file, colliders=feet, contact_geoms=feet, **choices)
+    assert "collider of 'base' left out (no such file): " in " ".join(robot.overrides)
+    assert not any(line.startswith(("warning: robot.urdf", "warning: toy.xml")) for line in robot.overrides)
+    every = build_toy(file, colliders=["*"], contact_geoms=feet, **choices)
+    assert any(line.startswith("warning: ") and "collides as the mesh" in line for line in every.overrides)
+    name = "base" if kind == "URDF" else "hull"
+    with pytest.raises(ValueError, match="collides as the mesh"):
+        build_toy(file, colliders=[*feet, name], contact_geoms=feet, **choices)

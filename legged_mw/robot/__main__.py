@@ -14,6 +14,7 @@ from legged_mw.robot import new, picture
 from legged_mw.robot.draft import Draft, as_env, draft, has_mirror
 from legged_mw.robot.measure import measure
 from legged_mw.robot.page import few_robots, page
+from legged_mw.robot.pose import as_lines
 from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
@@ -64,7 +65,10 @@ def show(env: RobotTask, title: str, image: Path | None, found: Draft | None = N
     """Print the page and draw the picture. ``found``: a draft, to list its guesses. ``rough``: on rough terrain."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
     health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation, rough)
-    print(page(health, title, found.guessed, found.notes) if found else page(health, title), flush=True)
+    print(
+        page(health, title, found.guessed, found.notes, as_lines(found.judged)) if found else page(health, title),
+        flush=True,
+    )
     if image is None:
         return
     try:

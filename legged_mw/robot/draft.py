@@ -25,14 +25,17 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.robot.makers import Maker, find_maker
 from legged_mw.robot.measure import (
+    GRAVITY,
     Gains,
     Joint,
+    beyond_euler,
     mass_matrices,
     stand_as_statue,
     stand_on_servos,
     suggest,
     what_joints_bear,
 )
+from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -44,6 +47,8 @@ from legged_mw.utils.task import import_task
 LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
 # factors on the suggested gains; published gains are at most twice the suggested ones [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
+# of the solver under implicitfast [ours: with 1 and 5 no robot stands, with 3 and 5 one of four falls]
+IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
@@ -60,6 +65,8 @@ class Draft(NamedTuple):
     pose_from: str  # source of the default pose, as text
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
     maker: Maker | None  # what its maker publishes, if that is known
+    gains_from: str  # source of the gains, as text
+    judged: list[Judged]  # the poses that were judged, the chosen one first
 
 
 def draft(file: Path) -> Draft:
@@ -68,23 +75,16 @@ def draft(file: Path) -> Draft:
     from_file = read.keyframe is not None
     env = _bare(file, from_file)
     robot, place = env.robot, np.array(env.start_place)
-    pose = np.clip(robot.pose, *robot.joint_range.T)
-    rest = stand_as_statue(robot, pose, place)
+    rest = stand_as_statue(robot, np.clip(robot.pose, *robot.joint_range.T), place)
     feet = guess_feet(robot, rest.qpos)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
-    published = maker.of("pose", robot.joint_names) if maker and not from_file else {}
-    bends = None if from_file or published else bent(robot, pose, feet)
-    if published:
-        bends = np.array([published.get(name, angle) for name, angle in zip(robot.joint_names, pose, strict=True)])
-        bends = np.clip(bends, *robot.joint_range.T)
-    if bends is not None:
-        pose, rest = bends, stand_as_statue(robot, bends, place)
+    neutral = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
+    judged = judge_poses(robot, neutral, feet, maker, from_file)
+    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T)
+    rest = stand_as_statue(robot, pose, place)
+    feet = guess_feet(robot, rest.qpos)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
-    how = (
-        "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
-    )
-    how = f"its maker's, {maker.source}" if maker and published else how
-    how = "the file's keyframe" if from_file else how
+    how = ", ".join(filter(None, (judged[0].candidate.name, judged[0].candidate.source)))
     pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
@@ -93,37 +93,67 @@ def draft(file: Path) -> Draft:
         raise ModelError(
             f"'{robot.root}', the root, is not above the lowest ends of limbs, {ends}; the health page is of robots that stand on them"
         )
-    firmness, gains = _firm(robot, pose, place, joints, feet)
+    gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [
-        f"pose: {how}",
+        f"pose: {how}{', though: ' * bool(judged[0].faults)}{'; '.join(judged[0].faults)}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
-        "gains: as suggested below"
-        if firmness == 1.0
-        else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
+        f"gains: {gains_from}",
     ]
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker)
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker, gains_from, judged)
 
 
-def _firm(
-    robot: RobotModel, pose: list[float], place: list[float], joints: Sequence[Joint], feet: Sequence[Foot]
-) -> tuple[float, list[Gains]]:
-    """The smallest of FIRMNESS at which the robot stands on its feet, and its gains.
+def _servos(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    maker: Maker | None,
+) -> tuple[list[Gains], str]:
+    """Gains of each joint, and where they come from: the maker's, else as suggested, else firmer.
 
-    1 if the robot stands at none of them, or has two feet: a biped falls over at any gains.
+    On more than two feet they are the smallest of FIRMNESS on which the robot stands. A biped falls on any.
     """
+    names = robot.joint_names
+    kp, kd = (maker.of(table, names) if maker else {} for table in ("kp", "kd"))
+    known = {name: Gains(kp[name], kd[name]) for name in names if name in kp and name in kd}
+    moment = GRAVITY * float(robot.physics.body_subtreemass[0]) * place[2]
+
+    def chosen(firmness: float) -> list[Gains]:
+        suggested = zip(names, suggest(joints, moment, firmness), strict=True)
+        return [known.get(name, gains) for name, gains in suggested]
+
+    if maker and len(known) == len(names):
+        return chosen(1.0), f"its maker's, {maker.source}"
+    some = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
+    for firmness in FIRMNESS if len(feet) > 2 else ():
+        if _stands(robot, pose, place, joints, feet, chosen(firmness)):
+            firmer = f"{firmness:g} times what is suggested below, to stand on its servos"
+            return chosen(firmness), ("as suggested below" if firmness == 1.0 else firmer) + some
+    return chosen(1.0), "as suggested below" + some
+
+
+def _stands(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    gains: Sequence[Gains],
+) -> bool:
+    """Whether the robot stands on its feet with these ``gains``."""
     model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
     for geom in range(robot.ground_geoms().stop, model.ngeom):
         model.geom_conaffinity[geom] *= model.geom(geom).name in touching
-    for firmness in FIRMNESS if len(feet) > 2 else ():
-        gains = suggest(joints, float(model.opt.timestep), firmness)
-        model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
-        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
-        firm = replace(robot, physics=model)
-        if stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
-            return firmness, gains
-    return 1.0, suggest(joints, float(model.opt.timestep))
+    model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
+    model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+    if beyond_euler(joints, gains, float(model.opt.timestep)):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations = IMPLICIT["iterations"], IMPLICIT["ls_iterations"]
+    firm = replace(robot, physics=model)
+    return stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands"
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
@@ -141,8 +171,8 @@ def _bare(file: Path, keyframe: bool) -> RobotTask:
 def as_env(found: Draft, file: Path) -> LeggedRobot:
     """One world of the draft's task."""
     cfg = parents(found)[0]()
-    cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
-    cfg.asset.file = str(file.resolve())
+    cfg.update({"env": {"num_envs": 1}, **values(found)}, where="the health page")
+    cfg.asset.file, cfg.sim.engine = str(file.resolve()), "mujoco"
     return LeggedRobot(cfg, "cpu")
 
 
@@ -171,7 +201,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if said := {
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
-        asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
+        asset["joint_speed_limits"] = short_table(said, names)
+    asset |= _motors(found)
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
@@ -184,10 +215,22 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
     }
+    if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
+        chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
     return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+
+
+def _motors(found: Draft) -> dict[str, dict[str, float]]:
+    """What a maker publishes of motors where the robot's file says nothing: armature [kg m^2], effort [N m]."""
+    if not found.maker:
+        return {}
+    bare = [joint.name for joint in found.joints if not joint.armature]
+    endless = [joint.name for joint in found.joints if not math.isfinite(joint.effort)]
+    said = {"armature": found.maker.of("armature", bare), "effort": found.maker.of("effort", endless)}
+    return {name: short_table(known, found.robot.joint_names) for name, known in said.items() if known}
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -219,6 +262,11 @@ def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
         if number != common:
             short[key] = number
     return short if _reads(short, names, numbers) else exact
+
+
+def short_table(said: dict[str, float], names: Sequence[str]) -> dict[str, float]:
+    """``table`` of numbers that are known for all ``names``; else ``said`` itself."""
+    return table([said[name] for name in names], names) if len(said) == len(names) else said
 
 
 def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[float]) -> bool:
@@ -271,6 +319,17 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     return [_foot(robot, body, soles[body]) for body in sorted(soles)]
 
 
+def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
+    """Raise ModelError if the file's mesh of a low end of a limb cannot be read: it may be a foot."""
+    model, data = robot.physics, posed(robot.physics, qpos[7:], qpos[:7])
+    low = min(float(data.geom_xpos[robot.id("geom", geom), 2]) for foot in feet for geom in foot.geoms)
+    for body in {*range(1, model.nbody)} - {*model.body_parentid}:
+        name = model.body(body).name
+        is_low = data.xpos[body, 2] < 0.5 * (low + float(qpos[2]))
+        if name in robot.names.lost and not robot.names.bodies[name] and is_low:
+            raise ModelError(robot.names.lost[name])
+
+
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
     """The sole of a body: its lowest geom, and geoms of that type at about that height.
 
@@ -290,41 +349,9 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
 
 
-# ---- the pose of a file without one: bent knees, each foot under its hip, level soles
+# ---- a biped's weights of the pose reward
 
-# Ours: knee angle [rad] about the axis to the left, by number of feet. A quadruped leans its thighs back (Go1 0.9 and
-# -1.8), a biped forwards.
-KNEE = {2: 0.6}
-KNEE_ELSE = -1.6
 WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # from configs/g1_flat.py
-_SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
-_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
-_MARGIN = 0.05  # [rad] distance to the limits of a joint
-
-
-def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
-    """``pose`` (D,) with all legs bent; None if a leg has fewer than two sideways joints.
-
-    A straight leg cannot push, and its servos have no preferred direction to bend. The first two joints of a leg about
-    the sideways axis are assumed to be hip and knee, and the leg to be straight with both at 0. A third one, the ankle,
-    keeps the sole level.
-    """
-    model, found = robot.physics, pose.copy()
-    data = posed(model, pose)
-    for foot in feet:
-        legs = [joint for joint in _joints_to(model, foot) if abs(data.xaxis[joint][1]) > _SIDEWAYS]
-        if len(legs) < 2:
-            return None
-        hip, knee, *ankle = legs
-        turn = KNEE.get(len(feet)) or KNEE_ELSE * _forward(data, model, knee, foot)
-        signs = np.sign(data.xaxis[legs, 1])
-        angles = [_within(model, knee, sign * turn * signs[1]) for sign in (1.0, -1.0)]
-        found[knee - 1] = max(angles, key=abs) if abs(angles[0]) < 0.5 * abs(turn) else angles[0]
-        found[hip - 1] = _over(model, found, hip, foot)
-        for joint, sign in zip(ankle[:1], signs[2:], strict=False):
-            leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
-            found[joint - 1] = _within(model, joint, -sign * leaning)
-    return found
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
@@ -332,49 +359,10 @@ def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot])
     model, data = robot.physics, posed(robot.physics, pose)
     weights = [HELD] * len(robot.joint_names)
     for foot in feet:
-        legs = _joints_to(model, foot)
-        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        legs = joints_to(model, foot)
+        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
         for joint in sideways[:2]:
             weights[joint - 1] = WALKS
         for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
             weights[joint - 1] = ANKLE
     return weights
-
-
-def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:
-    """The direction of the knee: 1.0 if the foot of the straight leg is below or ahead of the knee, -1.0 if behind."""
-    ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
-    return -1.0 if ahead < -_BEHIND else 1.0
-
-
-def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
-    """The joints from the root to the foot, without the root joint."""
-    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
-    while body:
-        first = int(model.body_jntadr[body])
-        joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
-        body = int(model.body_parentid[body])
-    return sorted(joints)
-
-
-def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
-    """The nearest angle within the joint's limits."""
-    if not model.jnt_limited[joint]:
-        return float(angle)
-    low, high = model.jnt_range[joint]
-    margin = min(_MARGIN, 0.25 * (high - low))
-    return float(np.clip(angle, low + margin, high - margin))
-
-
-def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot) -> float:
-    """The hip angle [rad] at which the foot is under the hip: the best of 200 angles within 90 deg."""
-    geoms = [model.geom(name).id for name in foot.geoms]
-    off = {}
-    for angle in np.linspace(-1.57, 1.57, 200):
-        trial = pose.copy()
-        trial[hip - 1] = allowed = _within(model, hip, angle)
-        data = posed(model, trial)
-        middle = data.geom_xpos[geoms].mean(axis=0)
-        away = middle - data.xanchor[hip]
-        off[allowed] = abs(float(away[0])) + (10.0 if away[2] > 0.0 else 0.0)
-    return round(min(off, key=lambda angle: off[angle]), 2)

@@ -36,8 +36,10 @@ _COMMENTS = {
     "joint_speed_limits": "[rad/s] the file's",
     "colliders": "the feet alone touch the ground",
     "pos": "[m] standing, computed",
-    "stiffness": "[N m/rad] LOOK: computed (legged_mw/robot/measure.py)",
     "damping": "[N m s/rad] LOOK: likewise",
+    "armature": "[kg m^2] of the rotors, published; the file has none",
+    "integrator": "explicit Euler does not bear these gains on such light limbs",
+    "iterations": "with 1 a robot does not even stand under implicitfast [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "lin_vel_x": "[m/s] LOOK: what you want of it",
     "lin_vel_y": "[m/s]",
@@ -99,7 +101,12 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     ]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
-    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
+    source = found.gains_from.replace("suggested below", "computed (legged_mw/robot/measure.py)")
+    comments = {
+        **_COMMENTS,
+        "default_joint_angles": f"[rad] LOOK: {found.pose_from}",
+        "stiffness": f"[N m/rad] LOOK: {source}",
+    }
     for section, fields in sections.items():
         lines += [f"    class {section}({base}.{section}):"]
         for field, value in fields.items():

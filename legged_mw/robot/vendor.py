@@ -53,10 +53,10 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
     """Read an MJCF or URDF, and keep its sensors named in ``wanted``. Raises ModelError if it is not a single robot."""
     if not file.is_file():
         raise ModelError(f"no {kind_of(file)} at {file}")
-    where, notes = file.name, []
+    where, notes, lost = file.name, list[str](), dict[str, str]()
     with naming(file):
         source = XmlSource(file)
-        spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
+        spec, speeds = read_urdf(source, notes, lost) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = _take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
@@ -68,11 +68,11 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         _balance(spec, notes)
         _rename_clashes(spec, notes)
         with warnings.catch_warnings(record=True) as said:
-            model = compile_readable(spec, where, notes)
+            model = compile_readable(spec, where, notes, lost)
         check_model(model)
         notes += [f"warning: {' '.join(str(each.message).split())}" for each in said]
     _check_joints(spec, where)
-    return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors)
+    return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors, lost)
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:

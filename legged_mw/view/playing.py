@@ -25,11 +25,10 @@ from torch import Tensor
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.checkpoint import load_tensors, save_whole
 from legged_mw.rl.flags import require_task
 from legged_mw.rl.learner_config import check_classes
 from legged_mw.rl.policies import PolicySource, actor_in, introduce, load_policy
-from legged_mw.rl.run_folder import checkpoints, reason_of
+from legged_mw.rl.run_folder import checkpoints, load_tensors, reason_of, save_whole
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
