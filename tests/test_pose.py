@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from legged_mw import ROOT
+from legged_mw.robot import makers
+from legged_mw.robot.draft import draft
 from legged_mw.robot.makers import FILE, find_maker, read_makers
 
 QUADRUPED = [f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf")]
@@ -41,3 +45,80 @@ def test_every_entry_names_its_source_and_no_other_robot_twice() -> None:
     makers = read_makers()
     assert len({maker.name for maker in makers}) == len(makers) > 10
     assert all("/" in maker.source for maker in makers), FILE
+
+
+# ---- the judge ----
+
+# Four legs of two links, 0.3 m each, with the feet FL, FR, RL, RR; ``knee`` and ``keyframe`` are attributes.
+LEG = """<body name="{name}_thigh" pos="{x} {y} 0"><joint name="{name}_thigh_joint" axis="0 1 0" range="-2 4"/>
+  <geom name="{name}_t" type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+  <body name="{name}_calf" pos="0 0 -0.3"><joint name="{name}_calf_joint" axis="0 1 0" range="{knee}"/>
+    <geom name="{name}_c" type="capsule" fromto="0 0 0 0 0 -0.28" size="0.02" mass="0.5"/>
+    <geom name="{name}" size="0.02" pos="0 0 -0.3" mass="0.05"/></body></body>"""
+
+
+def four_legs(folder: Path, knees: dict[str, str], angles: str = "", height: float = 0.45) -> Path:
+    """A quadruped whose keyframe, if ``angles`` of one leg are given, has its root at ``height`` [m]."""
+    places = {"FL": (0.3, 0.15), "FR": (0.3, -0.15), "RL": (-0.3, 0.15), "RR": (-0.3, -0.15)}
+    legs = "".join(LEG.format(name=name, x=x, y=y, knee=knees[name[0]]) for name, (x, y) in places.items())
+    key = f'<keyframe><key name="home" qpos="0 0 {height} 1 0 0 0{f" {angles}" * 4}"/></keyframe>' if angles else ""
+    file = folder / "four.xml"
+    file.write_text(
+        '<mujoco><compiler angle="radian" autolimits="true"/><default><joint actuatorfrcrange="-80 80"/></default>'
+        '<worldbody><body name="trunk" pos="0 0 0.6"><freejoint/><geom name="trunk" type="box" size="0.35 0.1 0.05" mass="15"/>'
+        f"{legs}</body></worldbody>{key}</mujoco>"
+    )
+    return file
+
+
+ONE_WAY = {"F": "-2.8 -0.5", "R": "-2.8 -0.5"}
+
+
+def test_the_keyframe_of_a_folded_robot_is_not_believed(tmp_path: Path) -> None:
+    """Calves beyond their limit, and a height in the keyframe at which it does not stand."""
+    found = draft(four_legs(tmp_path, ONE_WAY, "1.4 -2.85"))
+    assert found.pose_from.startswith("knees bent") and found.place[2] > 0.4
+    [keyframe] = [each for each in found.judged if each.candidate.rank == 0]
+    said = " ".join(keyframe.faults)
+    assert all(word in said for word in ("end of the range", "folded", "0.45 m"))
+
+
+def test_a_keyframe_without_a_fault_is_believed(tmp_path: Path) -> None:
+    found = draft(four_legs(tmp_path, ONE_WAY, "0.9 -1.8", 0.39))
+    assert found.pose == [0.9, -1.8] * 4 and found.pose_from == "the file's keyframe"
+
+
+def test_a_knee_that_cannot_be_straight_has_three_quarters_of_its_stroke(tmp_path: Path) -> None:
+    angles = draft(four_legs(tmp_path, ONE_WAY)).pose
+    assert angles[1] == pytest.approx(-1.43, abs=0.03) and angles[0] == pytest.approx(-angles[1] / 2, abs=0.02)
+    other = draft(four_legs(tmp_path, {"F": "-2.8 -0.5", "R": "0.5 2.8"})).pose
+    assert other[5] == pytest.approx(1.43, abs=0.03) and other[:2] == angles[:2]
+
+
+def test_a_knee_that_turns_both_ways_is_bent_less(tmp_path: Path) -> None:
+    found = draft(four_legs(tmp_path, {"F": "-9 9", "R": "-9 9"}))
+    assert found.pose[:2] == pytest.approx([0.47, -0.95], abs=0.03)
+    assert any("other way" in each.candidate.name for each in found.judged[1:])
+
+
+@pytest.mark.parametrize(("stem", "most"), [("a1_style", 0.3), ("anymal_c_style", 0.2), ("g1_12dof_style", 0.1)])
+def test_without_the_table_the_pose_is_near_the_makers(stem: str, most: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = next((ROOT / "tests/data").glob(f"{stem}.*"))
+    known = draft(file)
+    monkeypatch.setattr(makers, "read_makers", lambda: [])
+    alone = draft(file)
+    assert known.judged[0].candidate.rank == 1 and alone.judged[0].candidate.rank == 2
+    assert max(abs(a - b) for a, b in zip(known.pose, alone.pose, strict=True)) < most
+
+
+def test_soles_are_level_whatever_the_angles_of_zero_are(tmp_path: Path) -> None:
+    """G1's feet, turned by 0.4 rad in the file: its ankles have to turn as much more."""
+    text = (ROOT / "tests/data/g1_12dof_style.xml").read_text()
+    turned = re.sub(r'(<body name="\w+_ankle_pitch_link"[^>]*?)>', r'\1 euler="0 0.4 0">', text)
+    assert turned != text
+    (tmp_path / "biped.xml").write_text(turned.replace("g1_12dof", "biped"))
+    found = draft(tmp_path / "biped.xml")
+    angle = dict(zip(found.robot.joint_names, found.pose, strict=True))
+    assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(
+        -0.4, abs=0.03
+    )

@@ -14,6 +14,7 @@ from legged_mw.robot import new, picture
 from legged_mw.robot.draft import Draft, as_env, draft, has_mirror
 from legged_mw.robot.measure import measure
 from legged_mw.robot.page import few_robots, page
+from legged_mw.robot.pose import as_lines
 from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
@@ -26,6 +27,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--picture", metavar="PNG", help="draw it from two sides: feet, IMU, colliders, joint axes")
     parser.add_argument("--new", metavar="NAME", help="write NAME.xml and NAME_flat.py, a first task for the robot")
     parser.add_argument("--out", metavar="DIR", default=".", help="where --new writes (default: here)")
+    parser.add_argument(
+        "--sim", action="store_true", help="--new writes a task for simulation alone: a told velocity, alike worlds"
+    )
     parser.add_argument("--force", action="store_true", help="--new may overwrite")
     parser.add_argument(
         "--pack",
@@ -51,7 +55,7 @@ def main() -> None:
     if args.new:
         # refuse before the page, not after it
         new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
-    found = draft(file)
+    found = draft(file, args.sim)
     env = as_env(found, file)
     show(env, file.name, image, found)
     if args.new:
@@ -71,7 +75,10 @@ def show(env: RobotTask, title: str, image: Path | None, found: Draft | None = N
     """Print the page and draw the picture. ``found``: a draft, to list its guesses. ``rough``: on rough terrain."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
     health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation, rough)
-    print(page(health, title, found.guessed, found.notes) if found else page(health, title), flush=True)
+    print(
+        page(health, title, found.guessed, found.notes, as_lines(found.judged)) if found else page(health, title),
+        flush=True,
+    )
     if image is None:
         return
     try:

@@ -26,14 +26,17 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.robot.makers import Maker, find_maker
 from legged_mw.robot.measure import (
+    GRAVITY,
     Gains,
     Joint,
+    beyond_euler,
     mass_matrices,
     stand_as_statue,
     stand_on_servos,
     suggest,
     what_joints_bear,
 )
+from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -45,6 +48,12 @@ from legged_mw.utils.task import import_task
 LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
 # factors on the suggested gains; published gains are at most twice the suggested ones [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
+# of the solver under implicitfast [ours: with 1 and 5 no robot stands, with 3 and 5 one of four falls]
+IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
+# reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
+# soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
+LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.5}
+LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "pose": 1.0, "action_rate": -0.02, "feet_orientation": -1.0}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
@@ -61,31 +70,27 @@ class Draft(NamedTuple):
     pose_from: str  # source of the default pose, as text
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
     maker: Maker | None  # what its maker publishes, if that is known
+    gains_from: str  # source of the gains, as text
+    judged: list[Judged]  # the poses that were judged, the chosen one first
+    simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
 
 
-def draft(file: Path) -> Draft:
+def draft(file: Path, simple: bool = False) -> Draft:
     """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF)."""
     read = read_robot(file)
     from_file = read.keyframe is not None
     env = _bare(file, from_file)
     robot, place = env.robot, np.array(env.start_place)
-    pose = np.clip(robot.pose, *robot.joint_range.T)
-    rest = stand_as_statue(robot, pose, place)
+    rest = stand_as_statue(robot, np.clip(robot.pose, *robot.joint_range.T), place)
     feet = guess_feet(robot, rest.qpos)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
-    published = maker.of("pose", robot.joint_names) if maker and not from_file else {}
-    bends = None if from_file or published else bent(robot, pose, feet)
-    if published:
-        bends = np.array([published.get(name, angle) for name, angle in zip(robot.joint_names, pose, strict=True)])
-        bends = np.clip(bends, *robot.joint_range.T)
-    if bends is not None:
-        pose, rest = bends, stand_as_statue(robot, bends, place)
+    neutral = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
+    judged = judge_poses(robot, neutral, feet, maker, from_file)
+    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T)
+    rest = stand_as_statue(robot, pose, place)
+    feet = guess_feet(robot, rest.qpos)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
-    how = (
-        "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
-    )
-    how = f"its maker's, {maker.source}" if maker and published else how
-    how = "the file's keyframe" if from_file else how
+    how = ", ".join(filter(None, (judged[0].candidate.name, judged[0].candidate.source)))
     pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
@@ -94,37 +99,68 @@ def draft(file: Path) -> Draft:
         raise ModelError(
             f"'{robot.root}', the root, is not above the lowest ends of limbs, {ends}; the health page is of robots that stand on them"
         )
-    firmness, gains = _firm(robot, pose, place, joints, feet)
+    gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [
-        f"pose: {how}",
+        f"pose: {how}{', though: ' * bool(judged[0].faults)}{'; '.join(judged[0].faults)}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
-        "gains: as suggested below"
-        if firmness == 1.0
-        else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
+        f"gains: {gains_from}",
     ]
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker)
+    notes = [*read.notes, *more]
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple)
 
 
-def _firm(
-    robot: RobotModel, pose: list[float], place: list[float], joints: Sequence[Joint], feet: Sequence[Foot]
-) -> tuple[float, list[Gains]]:
-    """The smallest of FIRMNESS at which the robot stands on its feet, and its gains.
+def _servos(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    maker: Maker | None,
+) -> tuple[list[Gains], str]:
+    """Gains of each joint, and where they come from: the maker's, else as suggested, else firmer.
 
-    1 if the robot stands at none of them, or has two feet: a biped falls over at any gains.
+    On more than two feet they are the smallest of FIRMNESS on which the robot stands. A biped falls on any.
     """
+    names = robot.joint_names
+    kp, kd = (maker.of(table, names) if maker else {} for table in ("kp", "kd"))
+    known = {name: Gains(kp[name], kd[name]) for name in names if name in kp and name in kd}
+    moment = GRAVITY * float(robot.physics.body_subtreemass[0]) * place[2]
+
+    def chosen(firmness: float) -> list[Gains]:
+        suggested = zip(names, suggest(joints, moment, firmness), strict=True)
+        return [known.get(name, gains) for name, gains in suggested]
+
+    if maker and len(known) == len(names):
+        return chosen(1.0), f"its maker's, {maker.source}"
+    some = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
+    for firmness in FIRMNESS if len(feet) > 2 else ():
+        if _stands(robot, pose, place, joints, feet, chosen(firmness)):
+            firmer = f"{firmness:g} times what is suggested below, to stand on its servos"
+            return chosen(firmness), ("as suggested below" if firmness == 1.0 else firmer) + some
+    return chosen(1.0), "as suggested below" + some
+
+
+def _stands(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    gains: Sequence[Gains],
+) -> bool:
+    """Whether the robot stands on its feet with these ``gains``."""
     model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
     for geom in range(robot.ground_geoms().stop, model.ngeom):
         model.geom_conaffinity[geom] *= model.geom(geom).name in touching
-    for firmness in FIRMNESS if len(feet) > 2 else ():
-        gains = suggest(joints, float(model.opt.timestep), firmness)
-        model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
-        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
-        firm = replace(robot, physics=model)
-        if stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
-            return firmness, gains
-    return 1.0, suggest(joints, float(model.opt.timestep))
+    model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
+    model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+    if beyond_euler(joints, gains, float(model.opt.timestep)):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations = IMPLICIT["iterations"], IMPLICIT["ls_iterations"]
+    firm = replace(robot, physics=model)
+    return stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands"
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
@@ -142,17 +178,19 @@ def _bare(file: Path, keyframe: bool) -> RobotTask:
 def as_env(found: Draft, file: Path) -> LeggedRobot:
     """One world of the draft's task."""
     cfg = parents(found)[0]()
-    cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
-    cfg.asset.file = str(file.resolve())
+    cfg.update({"env": {"num_envs": 1}, **values(found)}, where="the health page")
+    cfg.asset.file, cfg.sim.engine = str(file.resolve()), "mujoco"
     return LeggedRobot(cfg, "cpu")
 
 
 def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]]:
     """The base classes of the task's configs."""
+    if len(found.feet) != 2 and found.simple:
+        return LeggedRobotCfg, LeggedRobotCfgPPO
+    presets = import_task(ROOT / "configs/base.py")
     if len(found.feet) == 2:
-        presets = import_task(ROOT / "configs/base.py")
         return presets.BipedCfg, presets.BipedCfgPPO
-    return LeggedRobotCfg, LeggedRobotCfgPPO
+    return presets.SimToRealCfg, presets.SimToRealCfgPPO
 
 
 def has_mirror(env: LeggedRobot) -> bool:
@@ -172,7 +210,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if said := {
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
-        asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
+        asset["joint_speed_limits"] = short_table(said, names)
+    asset |= _motors(found)
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
@@ -180,33 +219,68 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),
-            "action_scale": 0.5,
+            "action_scale": _action_scale(found),
         },
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
     }
+    if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
+        chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
+    if chosen["control"]["action_scale"] < 0.5:
+        chosen["normalization"] = {"clip_actions": 4.0}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
-    return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+    if found.simple:
+        return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+    weights = table(pose_weights(found.robot, found.pose, found.feet), names)
+    rewards = {**low, "pose_weights": weights, "scales": dict(LOOKS)}
+    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "rewards": rewards}
+
+
+def _action_scale(found: Draft) -> float:
+    """How far an action of 1 moves a joint [rad]: less where 0.5 rad ask for more than 0.7 of most motors' effort."""
+    asked = sorted(gain.kp / joint.effort for gain, joint in zip(found.gains, found.joints, strict=True))
+    return 0.5 if 0.5 * asked[len(asked) // 2] <= 0.7 else 0.25
+
+
+def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
+    """Randomized worlds: what differs with the robot's size, and delays. ``shares`` of the mass, on the root."""
+    mass = float(found.robot.physics.body_subtreemass[0])
+    return {"base_mass": [round(share * mass, 2) for share in shares], "delay_ms": [0.0, 15.0]}
+
+
+def _motors(found: Draft) -> dict[str, dict[str, float]]:
+    """What a maker publishes of motors where the robot's file says nothing: armature [kg m^2], effort [N m]."""
+    if not found.maker:
+        return {}
+    bare = [joint.name for joint in found.joints if not joint.armature]
+    endless = [joint.name for joint in found.joints if not math.isfinite(joint.effort)]
+    said = {"armature": found.maker.of("armature", bare), "effort": found.maker.of("effort", endless)}
+    return {name: short_table(known, found.robot.joint_names) for name, known in said.items() if known}
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Further values for a biped: they replace BipedCfg's numbers of a G1, and simplify training on a few cores."""
-    robot, mass = found.robot, float(found.robot.physics.body_subtreemass[0])
+    """Further values for a biped: they replace BipedCfg's numbers of a G1; a simple task leaves out what is hard."""
+    robot = found.robot
     data = posed(robot.physics, found.pose)
     left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
+    rewards: dict[str, Any] = {
+        **low,
+        "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
+        "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
+        "scales": {"contact_phase": 1.0, "no_fly": 0.5, **({} if found.simple else LOOKS_OF_A_BIPED)},
+    }
+    worlds = _worlds(found, (-0.03, 0.06))
+    if not found.simple:
+        ranges = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1.0, 1.0]}
+        return {"commands": {"ranges": ranges}, "domain_rand": worlds, "rewards": rewards}
     return {
         "commands": {"ranges": {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}},
         "observations": {"leave_out": {}},
-        "domain_rand": {"enable": False, "base_mass": [round(share * mass, 2) for share in (-0.03, 0.06)]},
+        "domain_rand": {"enable": False, "base_mass": worlds["base_mass"]},
         "perturbation": {"push": False, "velocity": [0.0, 4.0]},
-        "rewards": {
-            **low,
-            "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
-            "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
-            "scales": {"contact_phase": 1.0, "no_fly": 0.5},
-        },
+        "rewards": rewards,
     }
 
 
@@ -220,6 +294,11 @@ def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
         if number != common:
             short[key] = number
     return short if _reads(short, names, numbers) else exact
+
+
+def short_table(said: dict[str, float], names: Sequence[str]) -> dict[str, float]:
+    """``table`` of numbers that are known for all ``names``; else ``said`` itself."""
+    return table([said[name] for name in names], names) if len(said) == len(names) else said
 
 
 def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[float]) -> bool:
@@ -318,91 +397,28 @@ def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
     return list(feet) if clash else new
 
 
-# ---- the pose of a file without one: bent knees, each foot under its hip, level soles
+# ---- weights of the pose reward
 
-# Ours: knee angle [rad] about the axis to the left, by number of feet. A quadruped leans its thighs back (Go1 0.9 and
-# -1.8), a biped forwards.
-KNEE = {2: 0.6}
-KNEE_ELSE = -1.6
-WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # from configs/g1_flat.py
-_SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
-_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
-_MARGIN = 0.05  # [rad] distance to the limits of a joint
-
-
-def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
-    """``pose`` (D,) with all legs bent; None if a leg has fewer than two sideways joints.
-
-    A straight leg cannot push, and its servos have no preferred direction to bend. The first two joints of a leg about
-    the sideways axis are assumed to be hip and knee, and the leg to be straight with both at 0. A third one, the ankle,
-    keeps the sole level.
-    """
-    model, found = robot.physics, pose.copy()
-    data = posed(model, pose)
-    for foot in feet:
-        legs = [joint for joint in _joints_to(model, foot) if abs(data.xaxis[joint][1]) > _SIDEWAYS]
-        if len(legs) < 2:
-            return None
-        hip, knee, *ankle = legs
-        turn = KNEE.get(len(feet)) or KNEE_ELSE * _forward(data, model, knee, foot)
-        signs = np.sign(data.xaxis[legs, 1])
-        angles = [_within(model, knee, sign * turn * signs[1]) for sign in (1.0, -1.0)]
-        found[knee - 1] = max(angles, key=abs) if abs(angles[0]) < 0.5 * abs(turn) else angles[0]
-        found[hip - 1] = _over(model, found, hip, foot)
-        for joint, sign in zip(ankle[:1], signs[2:], strict=False):
-            leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
-            found[joint - 1] = _within(model, joint, -sign * leaning)
-    return found
+# from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
+WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
+KNEE_WALKS = 0.1  # on more feet, where all other joints have 1 [MuJoCo Playground]
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
-    """Weights (D,) of a biped's pose reward: smallest for hip and knee, small for the ankle, large for all others."""
+    """Weights (D,) of the pose reward: smallest for what walks (hip and knee; on more than two feet the knee alone)."""
     model, data = robot.physics, posed(robot.physics, pose)
-    weights = [HELD] * len(robot.joint_names)
+    weights = [QUIET if len(feet) == 2 else 1.0] * len(robot.joint_names)
     for foot in feet:
-        legs = _joints_to(model, foot)
-        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        legs = joints_to(model, foot)
+        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
+        if len(feet) != 2:
+            for joint in sideways[1:2]:
+                weights[joint - 1] = KNEE_WALKS
+            continue
+        for joint in legs:
+            weights[joint - 1] = HELD
         for joint in sideways[:2]:
             weights[joint - 1] = WALKS
         for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
             weights[joint - 1] = ANKLE
     return weights
-
-
-def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:
-    """The direction of the knee: 1.0 if the foot of the straight leg is below or ahead of the knee, -1.0 if behind."""
-    ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
-    return -1.0 if ahead < -_BEHIND else 1.0
-
-
-def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
-    """The joints from the root to the foot, without the root joint."""
-    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
-    while body:
-        first = int(model.body_jntadr[body])
-        joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
-        body = int(model.body_parentid[body])
-    return sorted(joints)
-
-
-def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
-    """The nearest angle within the joint's limits."""
-    if not model.jnt_limited[joint]:
-        return float(angle)
-    low, high = model.jnt_range[joint]
-    margin = min(_MARGIN, 0.25 * (high - low))
-    return float(np.clip(angle, low + margin, high - margin))
-
-
-def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot) -> float:
-    """The hip angle [rad] at which the foot is under the hip: the best of 200 angles within 90 deg."""
-    geoms = [model.geom(name).id for name in foot.geoms]
-    off = {}
-    for angle in np.linspace(-1.57, 1.57, 200):
-        trial = pose.copy()
-        trial[hip - 1] = allowed = _within(model, hip, angle)
-        data = posed(model, trial)
-        middle = data.geom_xpos[geoms].mean(axis=0)
-        away = middle - data.xanchor[hip]
-        off[allowed] = abs(float(away[0])) + (10.0 if away[2] > 0.0 else 0.0)
-    return round(min(off, key=lambda angle: off[angle]), 2)

@@ -1,0 +1,457 @@
+"""The default pose of a draft: candidates, and a judge that says what is wrong with each.
+
+Candidates are the file's keyframe, the pose that the maker publishes, crouches that are computed here, and all joints at
+0. The file's keyframe is taken if it has no fault, else the maker's pose, else the best crouch. If all have faults, the
+least bad of them is taken.
+
+A leg is the chain of joints from the root to a foot. Its joints about the sideways axis move the foot in a plane: the
+first is the hip, the last one of a foot with a flat sole levels that sole, and of those between, the knee is the one that
+changes the leg's length most. Angles of the sole are rotations about y (left) [rad]; lengths are in metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.robot.makers import Maker
+from legged_mw.robot.measure import SAG, inside_by
+from legged_mw.sim.joints import posed
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.surface_points import surfaces
+
+FloatArray = NDArray[np.float64]
+
+# Ours: how far a knee that can be straight is bent, by number of feet. Published: G1 and H1 0.3, T1 0.4; ANYmal 1.1, of its straight leg.
+FOLD, FOLD_ELSE = {2: 0.35}, 0.95  # [rad]
+# A knee that cannot be straight is bent so that the leg has this share of its stroke, from shortest to longest. With it
+# A1, Go2 and B2 bend by 1.43 to 1.55 rad; their makers say 1.5.
+STROKE = 0.73
+DEPTHS = (0.5, 1.0, 1.5)  # multiples of the bend above, for the candidates
+_STRAIGHT = 0.995  # a knee can be straight if the leg then has this share of its length
+SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
+_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
+_MARGIN = 0.05  # [rad] distance of a computed angle to the limits of a joint
+_FLAT = 0.04  # [m] a sole of this length is flat
+_THIN = 0.004  # [m] points of a sole this far above its lowest one lie in its plane
+_PRESSED = 0.015  # [m] points of a sole this far above its lowest one touch the ground under the robot's weight
+
+# Bounds of the judge; ours. Go2's keyframe has a reach of 0.62 and a height 2 cm off; B2's folded robot has 0.22 and 35.
+AT_LIMIT = 0.02  # [rad] a joint nearer to its limit is at it
+FOLDED, UPRIGHT = 0.45, 0.1  # least share of the straight leg's length; least bend of a knee [rad]
+TILTED = 0.15  # [rad] of a flat sole
+AWAY = 0.35  # of the leg's length: foot from below its hip, along x
+HEIGHT = 0.2  # of the leg's length: the keyframe's height against the computed one
+UNEVEN = 0.1  # of the leg's length: lowest points of the feet
+BEND = 0.4  # [rad] of a knee, from the wanted bend: counts as much as a sag of SAG
+
+
+class Sole(Protocol):
+    """A foot: its geoms."""
+
+    @property
+    def geoms(self) -> tuple[str, ...]: ...
+
+
+class _Whole(NamedTuple):
+    """A foot with all of its body's geoms that collide: a tilted sole shows its lowest ones alone."""
+
+    geoms: tuple[str, ...]
+
+
+class Leg(NamedTuple):
+    """A leg in its plane, at the neutral pose. P points of the sole."""
+
+    joints: tuple[int, ...]  # sideways joints from hip to foot, indices of the model
+    knee: int  # place in ``joints``
+    rest: FloatArray  # (joints,) [rad] their neutral angles
+    spare: (
+        FloatArray  # (joints,) [rad] turns of those that are neither hip, knee nor ankle; a range without 0: its middle
+    )
+    signs: FloatArray  # of their axes along y
+    places: FloatArray  # (joints, 2) [m] x and z
+    sole: FloatArray  # (P, 2) [m] x and z
+    level: float  # [rad] rotation of the foot that levels its sole
+    flat: bool  # whether the sole is flat, and the last joint levels it
+    straight: float  # [rad] angle of the knee at which the leg is longest
+    folds: tuple[float, ...]  # [rad] how far the knee is bent from there, with its sign; the first is the better way
+    length: float  # [m] of the straight leg
+
+
+class Candidate(NamedTuple):
+    """A pose to be judged."""
+
+    name: str
+    angles: FloatArray  # (D,) [rad]
+    rank: int  # 0 the file's, 1 the maker's, 2 computed, 3 zero
+    height: float | None = None  # [m] of the root, if the pose came with one
+    source: str = ""  # who says so
+
+
+class Judged(NamedTuple):
+    """A candidate with its faults. ``off`` compares two without faults: less is better."""
+
+    candidate: Candidate
+    faults: tuple[str, ...]
+    off: float
+    height: float  # [m] of the root, with the lowest foot on the ground
+    reach: float  # share of the straight leg's length, of the shortest leg
+    margin: float  # [m] of the centre of mass inside of what the feet span; negative: outside
+    sag: float  # [rad] largest of the legs' servos
+
+    @property
+    def verdict(self) -> str:
+        return "; ".join(self.faults) or "no fault"
+
+
+def judge_poses(
+    robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole], maker: Maker | None, keyframe: bool
+) -> list[Judged]:
+    """All candidates, the chosen one first. ``neutral`` (D,): all joints at 0 or at the nearest end of their range.
+
+    ``keyframe``: whether ``robot.pose`` is that of the file's keyframe.
+    """
+    feet = [_whole(robot.physics, neutral, foot) for foot in feet]
+    legs = find_legs(robot, neutral, feet)
+    candidates = []
+    if keyframe and robot.keyframe is not None:
+        candidates.append(Candidate("the file's keyframe", np.array(robot.pose), 0, robot.keyframe.height))
+    if maker and maker.pose:
+        said = maker.of("pose", robot.joint_names)
+        angles = [said.get(name, angle) for name, angle in zip(robot.joint_names, neutral, strict=True)]
+        candidates.append(Candidate("its maker's", np.array(angles), 1, source=maker.source))
+    candidates += crouches(robot, neutral, legs)
+    candidates.append(Candidate("all joints at 0, or at the nearest end of their range", neutral, 3))
+    judged = [judge(robot, candidate, legs, feet, maker) for candidate in candidates]
+    return sorted(judged, key=lambda each: (bool(each.faults), *_order(each)))
+
+
+def _order(judged: Judged) -> tuple[float, float]:
+    """Without faults the source of a pose counts first; with faults their number, and how far it is off."""
+    if not judged.faults:
+        return judged.candidate.rank, judged.off
+    return len(judged.faults), judged.off
+
+
+# ---- legs ----
+
+
+def find_legs(robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole]) -> list[Leg]:
+    """The legs, one for each foot; none if a foot has fewer than two sideways joints."""
+    model = robot.physics
+    data = posed(model, neutral)
+    points = surfaces(model, data, [geom for foot in feet for geom in foot.geoms])
+    legs = []
+    for foot in feet:
+        joints = [joint for joint in joints_to(model, foot) if _is_sideways(model, data, joint)]
+        if len(joints) < 2:
+            return []
+        sole = np.concatenate([points[geom] for geom in foot.geoms])[:, [0, 2]]
+        legs.append(_leg(model, data, neutral, joints, sole, len(feet)))
+    return legs
+
+
+def _whole(model: mujoco.MjModel, neutral: FloatArray, foot: Sole) -> Sole:
+    """The foot, with all geoms of its body if the leg has an ankle; else a shank may belong to that body."""
+    data = posed(model, neutral)
+    if sum(_is_sideways(model, data, joint) for joint in joints_to(model, foot)) < 3:
+        return foot
+    body = model.body(int(model.geom(foot.geoms[0]).bodyid[0]))
+    geoms = range(int(body.geomadr[0]), int(body.geomadr[0] + body.geomnum[0]))
+    return _Whole(tuple(model.geom(geom).name for geom in geoms if model.geom_conaffinity[geom]))
+
+
+def joints_to(model: mujoco.MjModel, foot: Sole) -> list[int]:
+    """The joints from the root to the foot, without the root joint."""
+    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
+    while body:
+        first = int(model.body_jntadr[body])
+        joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
+        body = int(model.body_parentid[body])
+    return sorted(joints)
+
+
+def _is_sideways(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> bool:
+    return model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and abs(data.xaxis[joint][1]) > SIDEWAYS
+
+
+def _leg(
+    model: mujoco.MjModel, data: mujoco.MjData, neutral: FloatArray, joints: list[int], sole: FloatArray, feet: int
+) -> Leg:
+    places, signs = data.xanchor[joints][:, [0, 2]].copy(), np.sign(data.xaxis[joints, 1])
+    rest, spans = neutral[np.array(joints) - 1], np.array([_range(model, joint) for joint in joints])
+    level, long = _level(signs, spans - rest[:, None], sole)
+    flat = long > _FLAT and len(joints) > 2
+    if flat:
+        up = _rotate(level, sole)[:, 1]
+        sole = sole[up <= up.min() + _PRESSED]
+    leg = Leg(tuple(joints), 1, rest, np.zeros(len(joints)), signs, places, sole, level, flat, 0.0, (), 0.0)
+    middle = range(1, len(joints) - (1 if flat else 0))
+    leg = leg._replace(knee=max(middle, key=lambda place: _stroke(leg, place, spans[place])))
+    for place in middle:
+        low, high = spans[place]
+        if place != leg.knee and not low + _MARGIN < 0.0 < high - _MARGIN:
+            leg.spare[place] = 0.5 * (low + high) - rest[place]
+    low, high = spans[leg.knee]
+    angles, lengths = _lengths(leg, leg.knee)
+    straight, inside = float(angles[lengths.argmax()]), (angles >= low) & (angles <= high)
+    if lengths[inside].max() >= _STRAIGHT * lengths.max():
+        bend = FOLD.get(feet, FOLD_ELSE)
+        # a quadruped's thighs lean back (Go1 0.9 and -1.8), a biped's forwards
+        better = signs[leg.knee] * (1.0 if feet == 2 or not _foot_ahead(leg) else -1.0)
+        folds = [way * bend for way in (better, -better) if low <= straight + way * bend <= high] or [0.0]
+    else:
+        wanted = lengths[inside].min() + STROKE * float(np.ptp(lengths[inside]))
+        folds = [angles[inside][np.abs(lengths[inside] - wanted).argmin()] - straight]
+    return leg._replace(straight=straight, length=float(lengths.max()), folds=tuple(float(fold) for fold in folds))
+
+
+def _lengths(leg: Leg, place: int) -> tuple[FloatArray, FloatArray]:
+    """Angles of the joint at ``place`` in a turn [rad], and the lengths of the leg at them [m]."""
+    angles, lengths = np.linspace(-math.pi, math.pi, 721), []
+    for angle in angles:
+        turns = leg.spare.copy()
+        turns[place] = angle - leg.rest[place]
+        lengths.append(float(np.linalg.norm(_end(leg, turns) - leg.places[0])))
+    return angles, np.array(lengths)
+
+
+def _stroke(leg: Leg, place: int, span: FloatArray) -> float:
+    """How much the joint at ``place`` changes the length of the leg within its ``span`` (2,) [rad]."""
+    angles, lengths = _lengths(leg, place)
+    inside = lengths[(angles >= span[0]) & (angles <= span[1])]
+    return float(np.ptp(inside)) if len(inside) else 0.0
+
+
+def _foot_ahead(leg: Leg) -> bool:
+    """Whether the foot of the neutral leg is below or ahead of its knee."""
+    return float(leg.sole[:, 0].mean() - leg.places[leg.knee, 0]) >= -_BEHIND
+
+
+def _rotate(angle: float, vector: FloatArray) -> FloatArray:
+    """``vector`` (..., 2) of x and z, turned about y by ``angle`` [rad]."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return vector @ np.array([[cos, -sin], [sin, cos]])
+
+
+def _anchors(leg: Leg, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (joints, 2) of the joints, and rotations (joints,) of what they carry, ``turns`` [rad] from neutral."""
+    pitch = np.cumsum(leg.signs * turns)
+    places = [leg.places[0]]
+    for i in range(1, len(leg.joints)):
+        places.append(places[-1] + _rotate(pitch[i - 1], leg.places[i] - leg.places[i - 1]))
+    return np.array(places), pitch
+
+
+def _end(leg: Leg, turns: FloatArray) -> FloatArray:
+    """The end of the leg (2,): the last joint above a flat sole, else the middle of the foot."""
+    places, pitch = _anchors(leg, turns)
+    if leg.flat:
+        return places[-1]
+    return places[-1] + _rotate(pitch[-1], leg.sole.mean(axis=0) - leg.places[-1])
+
+
+def _level(signs: FloatArray, spans: FloatArray, sole: FloatArray) -> tuple[float, float]:
+    """The rotation [rad] of the foot at which most of its sole touches the ground, and the length of that part [m].
+
+    Of equally good ones it is the smallest. ``spans`` (joints, 2): how far the joints turn from neutral; the rotation is
+    within what they allow, and within 90 degrees.
+    """
+    ends = np.sort(signs[:, None] * spans, axis=1).sum(axis=0)
+    low, high = max(float(ends[0]), -0.5 * math.pi), min(float(ends[1]), 0.5 * math.pi)
+    best = (0.0, 0.0)
+    for angle in sorted(np.linspace(low, high, 181), key=abs):
+        turned = _rotate(float(angle), sole)
+        touching = turned[turned[:, 1] <= turned[:, 1].min() + _THIN, 0]
+        if (long := float(np.ptp(touching))) > best[1] + 0.002:
+            best = (float(angle), long)
+    return best
+
+
+def _range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
+    if not model.jnt_limited[joint]:
+        return -math.pi, math.pi
+    low, high = model.jnt_range[joint]
+    return float(low), float(high)
+
+
+# ---- crouches ----
+
+
+def crouches(robot: RobotModel, neutral: FloatArray, legs: Sequence[Leg]) -> list[Candidate]:
+    """Crouches of several depths, with the knees to both sides where they can; feet flat and under the hips."""
+    if not legs:
+        return []
+    found = {}
+    for way in range(max(len(leg.folds) for leg in legs)):
+        for depth in DEPTHS:
+            angles = neutral.copy()
+            for leg in legs:
+                bend = depth * leg.folds[min(way, len(leg.folds) - 1)]
+                angles[np.array(leg.joints) - 1] = _bend(robot.physics, leg, leg.straight + bend)
+            middle = round(float(np.mean([abs(leg.folds[0]) for leg in legs])) * depth, 2)
+            name = f"knees bent by {middle:g} rad{', the other way' if way else ''}"
+            found[angles.round(2).tobytes()] = Candidate(name, angles, 2)
+    return list(found.values())
+
+
+def _bend(model: mujoco.MjModel, leg: Leg, knee: float) -> FloatArray:
+    """The angles (joints,) of the leg with this angle of its knee [rad]."""
+    turns = leg.spare.copy()
+    turns[leg.knee] = _within(model, leg.joints[leg.knee], knee) - leg.rest[leg.knee]
+    # turn the hip until the foot is under it
+    along = float(_rotate(leg.level, leg.sole - leg.places[-1])[:, 0].mean()) if leg.flat else 0.0
+    end = _end(leg, turns) - leg.places[0]
+    below = math.sqrt(max(float(end @ end) - along**2, 0.0))
+    turn = math.remainder(math.atan2(end[1], end[0]) - math.atan2(-below, -along), 2.0 * math.pi)
+    turns[0] = _within(model, leg.joints[0], leg.signs[0] * turn + leg.rest[0]) - leg.rest[0]
+    if leg.flat:
+        carried = float((leg.signs * turns)[:-1].sum())
+        turn = leg.signs[-1] * math.remainder(leg.level - carried, 2.0 * math.pi)
+        turns[-1] = _within(model, leg.joints[-1], turn + leg.rest[-1]) - leg.rest[-1]
+    return leg.rest + turns
+
+
+def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
+    """The nearest angle within the joint's limits."""
+    if not model.jnt_limited[joint]:
+        return float(angle)
+    low, high = model.jnt_range[joint]
+    margin = min(_MARGIN, 0.25 * (high - low))
+    return float(np.clip(angle, low + margin, high - margin))
+
+
+# ---- the judge ----
+
+
+def judge(
+    robot: RobotModel, candidate: Candidate, legs: Sequence[Leg], feet: Sequence[Sole], maker: Maker | None
+) -> Judged:
+    """The faults of a pose, and how far it is off a good one."""
+    model = robot.physics
+    angles = np.clip(candidate.angles, *robot.joint_range.T)
+    data = posed(model, angles)
+    mujoco.mj_comPos(model, data)
+    points = surfaces(model, data, [geom for foot in feet for geom in foot.geoms])
+    soles = [np.concatenate([points[geom] for geom in foot.geoms]) for foot in feet]
+    lows = np.array([sole[:, 2].min() for sole in soles])
+    size = max((leg.length for leg in legs), default=max(-float(lows.min()), 0.1))
+    down = [sole for sole, low in zip(soles, lows, strict=True) if low <= lows.min() + UNEVEN * size]
+    touching = np.concatenate([sole[sole[:, 2] <= sole[:, 2].min() + _PRESSED] for sole in down])
+    margin = inside_by(touching[:, :2], data.subtree_com[0, :2])
+    faults = [*_limits(robot, candidate.angles, legs)]
+    reach, off = 1.0, 0.0
+    for leg in legs:
+        fault, reached, far = _posture(angles, leg)
+        faults, reach, off = [*faults, *fault], min(reach, reached), off + far / len(legs)
+    if candidate.height is not None and abs(candidate.height + lows.min()) > HEIGHT * size:
+        faults.append(f"says the root is {candidate.height:.2f} m high, but stands at {-lows.min():.2f} m")
+    if (uneven := float(np.ptp(lows))) > UNEVEN * size:
+        faults.append(f"lifts a foot by {100 * uneven:.0f} cm")
+    if margin < 0.0:
+        faults.append(f"centre of mass {-1e3 * margin:.0f} mm outside of the feet")
+    flat = bool(legs) and all(leg.flat for leg in legs)
+    sag, worst = _sag(robot, data, feet, soles, maker, flat)
+    if sag > SAG:
+        faults.append(f"{worst} sags by {sag:.2f} rad")
+    unique = tuple(dict.fromkeys(faults))
+    return Judged(candidate, unique, off + sag / SAG, -float(lows.min()), reach, margin, sag)
+
+
+def _limits(robot: RobotModel, angles: FloatArray, legs: Sequence[Leg]) -> list[str]:
+    """Joints of legs at their limit, and others beyond it."""
+    walking = {joint - 1 for leg in legs for joint in leg.joints}
+    low, high = robot.joint_range.T
+    room = np.minimum(angles - low, high - angles)
+    bad = [i for i in range(len(angles)) if room[i] < (AT_LIMIT if i in walking else -AT_LIMIT)]
+    if not bad:
+        return []
+    some = ", ".join(robot.joint_names[i] for i in bad[:2]) + (f" and {len(bad) - 2} more" if bad[2:] else "")
+    return [f"{some} at the end of the range"]
+
+
+def _posture(angles: FloatArray, leg: Leg) -> tuple[list[str], float, float]:
+    """The faults of one leg, its share of the straight leg's length, and how far it is off a good crouch."""
+    faults, turns = [], angles[np.array(leg.joints) - 1] - leg.rest
+    places, pitch = _anchors(leg, turns)
+    reach = float(np.linalg.norm(_end(leg, turns) - leg.places[0])) / leg.length
+    bend = angles[leg.joints[leg.knee] - 1] - leg.straight
+    if reach < FOLDED:
+        faults.append(f"folded: legs at {100 * reach:.0f} % of their length")
+    if abs(bend) < UPRIGHT:
+        faults.append("straight knees")
+    middle = places[-1] + _rotate(float(pitch[-1]), leg.sole.mean(axis=0) - leg.places[-1])
+    away = abs(float(middle[0] - leg.places[0, 0])) / leg.length
+    if away > AWAY:
+        faults.append("feet not under the hips")
+    tilt = abs(math.remainder(float(pitch[-1]) - leg.level, 2.0 * math.pi)) if leg.flat else 0.0
+    if tilt > TILTED:
+        faults.append(f"soles tilted by {tilt:.2f} rad")
+    return faults, reach, abs(bend - leg.folds[0]) / BEND + away / AWAY + tilt / TILTED
+
+
+def _sag(
+    robot: RobotModel,
+    data: mujoco.MjData,
+    feet: Sequence[Sole],
+    soles: Sequence[FloatArray],
+    maker: Maker | None,
+    flat: bool,
+) -> tuple[float, str]:
+    """The largest sag [rad] of a leg's servo, and its joint.
+
+    The servo's stiffness is the maker's, else full effort at 1 rad, as in ``measure.suggest``. ``flat``: the feet have
+    flat soles.
+    """
+    model, names = robot.physics, robot.joint_names
+    mujoco.mj_forward(model, data)
+    torque, com = data.qfrc_bias.copy(), data.subtree_com[0, :2]
+    places = np.array([sole.mean(axis=0) for sole in soles])
+    weight = float(model.body_subtreemass[0]) * float(np.linalg.norm(model.opt.gravity))
+    # the forces of the feet balance the weight; what they cannot balance, flat soles do by pressing off their middle
+    balance = np.vstack([np.ones(len(feet)), places[:, :2].T - com[:, None]])
+    forces = np.clip(np.linalg.lstsq(balance, np.array([weight, 0.0, 0.0]), rcond=None)[0], 0.0, None)
+    forces *= weight / max(float(forces.sum()), 1e-9)
+    if flat:
+        places[:, :2] += com - forces @ places[:, :2] / weight
+    for foot, place, force in zip(feet, places, forces, strict=True):
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, place, int(model.geom(foot.geoms[0]).bodyid[0]))
+        torque -= jacobian[2] * force
+    known = maker.of("kp", names) if maker else {}
+    walking = sorted({joint - 1 for foot in feet for joint in joints_to(model, foot)})
+    stiffness = {i: known.get(names[i]) or float(robot.effort_range[i, 1]) for i in walking}
+    sags = {i: abs(float(torque[6 + i])) / stiffness[i] for i in walking if stiffness[i] > 0.0}
+    if not sags:
+        return 0.0, ""
+    worst = max(sags, key=lambda i: sags[i])
+    return sags[worst], names[worst]
+
+
+# ---- as text ----
+
+
+def as_lines(judged: Sequence[Judged]) -> list[str]:
+    """A table of all candidates, the chosen one first, and why the others were not chosen."""
+    rows = [("pose", "root [m]", "legs", "com [mm]", "sag [rad]", "")]
+    for i, each in enumerate(judged):
+        why = "chosen; " * (i == 0) + (each.verdict if each.faults else "" if i == 0 else _why_not(judged[0], each))
+        numbers = f"{each.height:.3f}", f"{100 * each.reach:.0f} %", f"{1e3 * each.margin:+.0f}", f"{each.sag:.2f}"
+        rows.append((each.candidate.name, *numbers, why.removesuffix("; ")))
+    widths = [max(len(row[column]) for row in rows) for column in range(5)]
+    lines = []
+    for name, *numbers, why in rows:
+        cells = [name.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(numbers, widths[1:], strict=True))]
+        lines.append("  ".join([*cells, why]).rstrip())
+    return lines
+
+
+def _why_not(chosen: Judged, other: Judged) -> str:
+    if other.candidate.rank > chosen.candidate.rank:
+        return "no fault, but nobody stated it"
+    return f"no fault, but further from a good crouch ({other.off:.1f} against {chosen.off:.1f})"
