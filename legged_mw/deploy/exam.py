@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, OWN, Contract, ContractError, Ends, read_contract
+from legged_mw.deploy.contract import CONTRACT_FILE, OWN, SCENE_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.hard_exam import run_hard, strip_png
 from legged_mw.deploy.robot import Floats, Measurement
@@ -44,11 +44,12 @@ def run_exam(
     common: bool = False,
     contact: str | None = None,
     edited: bool = False,
+    scene: str | Path = SCENE_FILE,
 ) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by its contract. Raises ContractError, ConfigError.
 
     ``common``: the contract's rules, but with the command range shared by all published policies of the robot.
-    ``contact`` and ``edited``: see DeployStage.
+    ``contact``, ``edited`` and ``scene``, its ``scene_file``: see DeployStage.
     """
     contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
@@ -56,7 +57,9 @@ def run_exam(
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
-    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact, edited=edited)
+    stage = DeployStage(
+        folder, len(wanted), threads=threads, scene_file=scene, ends=ends, contact=contact, edited=edited
+    )
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(walking.EXAM_SECONDS / stage.dt)):

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import Contract, Ends, read_contract
+from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Fleet, lowest_point
 from legged_mw.deploy.stage import DeployStage
@@ -27,15 +27,17 @@ PICTURES, WIDTH, HEIGHT = 6, 240, 260  # of a strip, over one stride; [px] of ea
 SEED = 1  # of the noise
 
 
-def run_hard(folder: Path, rules: ExamRules, walks: bool, edited: bool = False) -> tuple[dict[str, Any], list[Floats]]:
+def run_hard(
+    folder: Path, rules: ExamRules, walks: bool, edited: bool = False, scene: str | Path = SCENE_FILE
+) -> tuple[dict[str, Any], list[Floats]]:
     """The hard exam's result, and qpos (nq,) of the robot at PICTURES moments of a stride; none if it fell.
 
-    ``walks``: by the walking exam. ``edited``: see read_contract. Raises ContractError.
+    ``walks``: by the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. Raises ContractError, UserError.
     """
     contract = read_contract(folder, edited)
     load = hard.load_of(rules, contract.mass)
-    conditions = run_conditions(folder, contract, rules, load, edited)
-    walk, poses = look(folder, contract, rules, edited)
+    conditions = run_conditions(folder, contract, rules, load, edited, scene)
+    walk, poses = look(folder, contract, rules, edited, scene)
     found = hard.looks(walk) if walk else None
     return hard.finish(rules, walks, conditions, found, len(contract.feet), load), poses
 
@@ -44,14 +46,19 @@ def run_hard(folder: Path, rules: ExamRules, walks: bool, edited: bool = False) 
 
 
 def run_conditions(
-    folder: Path, contract: Contract, rules: ExamRules, load: float, edited: bool = False
+    folder: Path,
+    contract: Contract,
+    rules: ExamRules,
+    load: float,
+    edited: bool = False,
+    scene: str | Path = SCENE_FILE,
 ) -> dict[str, Any]:
     """Condition -> falls, errors, drift and pushes; each condition has its own range of worlds."""
     asked = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
     count = len(asked) * len(CONDITIONS)
     wanted = commands_of(contract, asked * len(CONDITIONS))
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
-    stage = DeployStage(folder, count, ends=ends, edited=edited)
+    stage = DeployStage(folder, count, ends=ends, scene_file=scene, edited=edited)
     apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(asked)), load)
     fell_at, velocity, position = np.full(count, math.inf), [], []
     for step in range(round(hard.SECONDS / stage.dt)):
@@ -112,12 +119,21 @@ def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
 # ---- one robot that is looked at ------------------------------------------------------------------------------------
 
 
-def look(folder: Path, contract: Contract, rules: ExamRules, edited: bool = False) -> tuple[Walk | None, list[Floats]]:
+def look(
+    folder: Path, contract: Contract, rules: ExamRules, edited: bool = False, scene: str | Path = SCENE_FILE
+) -> tuple[Walk | None, list[Floats]]:
     """A walk straight ahead at half of the highest vx, and poses of one stride; None if the robot falls."""
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
     witness: list[Witness] = []
     stage = DeployStage(
-        folder, 1, threads=1, ends=ends, change=_solve_well, edited=edited, each=lambda: witness[0].sample()
+        folder,
+        1,
+        threads=1,
+        scene_file=scene,
+        ends=ends,
+        change=_solve_well,
+        edited=edited,
+        each=lambda: witness[0].sample(),
     )
     witness.append(Witness(stage.fleet))
     wanted = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
@@ -139,7 +155,7 @@ def look(folder: Path, contract: Contract, rules: ExamRules, edited: bool = Fals
 
 def _solve_well(model: mujoco.MjModel) -> None:
     """MuJoCo's own iterations: after training's single one a foot's force is a matter of chance, up to 12 weights."""
-    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
 
 
 class Witness:
@@ -151,7 +167,7 @@ class Witness:
         self.trunk, self.feet = trunk_of(fleet.model), feet_of(fleet)
         self._joints = [self.model.joint(name).id for name in contract.joints]
         self._dofs, self._angles = self.model.jnt_dofadr[self._joints], self.model.jnt_qposadr[self._joints]
-        self._damping = contract.damping if contract.motors.law == "servo" else np.zeros(len(self._joints))
+        self._damping = contract.damping if fleet.damps_by_joint else np.zeros(len(self._joints))
         bodies = [self.trunk, *(int(self.model.geom_bodyid[geoms[0]]) for geoms in self.feet)]
         start = mujoco.MjData(self.model)
         start.qpos[:] = fleet.qpos[0]

@@ -36,6 +36,7 @@ from legged_mw.deploy.contract import (
     target_range,
 )
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
+from legged_mw.deploy.user_scene import fit
 from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
@@ -96,18 +97,19 @@ class Fleet:
         contract: Contract,
         count: int = 1,
         threads: int = 0,
-        scene_file: str = SCENE_FILE,
+        scene_file: str | Path = SCENE_FILE,
         whole: bool = False,
         change: Change | None = None,
         each: Callable[[], None] | None = None,
     ) -> None:
         """Load the scene and put every robot into its first keyframe.
 
-        ``whole``: the whole body can touch the ground, not only the feet.
+        ``scene_file``: a file's name in the export, or the path of a scene of the user's; ``contract`` is then what it is
+        in that scene. ``whole``: the whole body can touch the ground, not only the feet.
         ``change`` edits the model before the first step. ``each`` is called after every physics step; ``read_data``
         then has the forces of that step. Raises ContractError.
         """
-        scene = read_scene(folder, contract, scene_file, whole)
+        scene, contract = enter_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
         if change:
             change(self.model)
@@ -237,10 +239,16 @@ class Fleet:
         for column in gains:
             self._batch.expand("actuator_gainprm")[:, self._actuators, column] *= factor.reshape(shape)
         if law == "servo":
-            self._batch.expand("actuator_biasprm")[:, self._actuators, 1] *= factor.reshape(shape)
+            self._batch.expand("actuator_biasprm")[:, self._actuators, 1:3] *= factor.reshape(-1, 1, 1)
+        if law == "servo" and self.damps_by_joint:
             self._batch.expand("dof_damping")[:, self._dofs] *= factor.reshape(shape)
         if not gains:
             self._batch.expand("actuator_gear")[:, self._actuators, 0] *= factor.reshape(shape)
+
+    @property
+    def damps_by_joint(self) -> bool:
+        """Whether the servos' damping is the joints', as in an export's scene; in a user's it is the actuators'."""
+        return self.contract.motors.law == "servo" and not self.model.actuator_biasprm[self._actuators, 2].any()
 
     def add_load(self, body: int, mass: Floats) -> None:
         """Add ``mass`` (N,) [kg] to ``body`` of each robot, and inertia in proportion."""
@@ -389,6 +397,14 @@ class DeployScene:
     contacts: list[np.ndarray]  # per foot: indices of its contact sensors in sensordata
 
 
+def enter_scene(folder: Path, contract: Contract, file: str | Path, whole: bool) -> tuple[DeployScene, Contract]:
+    """The scene, and the contract in it. Raises ContractError, and UserError for a user's scene that does not fit."""
+    if isinstance(file, str):
+        return read_scene(folder, contract, file, whole), contract
+    spec, contract = fit(file, folder, contract, lowest_point)
+    return _find_all(spec, spec.compile(), file.name, contract), contract
+
+
 def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> DeployScene:
     """Load ``file`` of an export and check that it is the contract's robot. Raises ContractError.
 
@@ -414,6 +430,15 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
             model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
+    scene = _find_all(spec, model, file, contract)
+    _check_order(model, contract)
+    joints = [model.joint(name).id for name in contract.joints]
+    _check_machine(model, file, contract, joints, scene.actuators.tolist())
+    return scene
+
+
+def _find_all(spec: mujoco.MjSpec, model: mujoco.MjModel, file: str, contract: Contract) -> DeployScene:
+    """Joints, servos and sensors by name."""
     joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]
     actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
     needed = [*SENSED, *([FALL] if contract.ends.falls_on else [])]
@@ -431,8 +456,6 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
                 f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}"
             )
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
-    _check_order(model, contract)
-    _check_machine(model, file, contract, joints, actuators)
     return DeployScene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
 
 

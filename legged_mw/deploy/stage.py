@@ -33,7 +33,7 @@ class DeployStage:
         num_worlds: int = 1,
         command: Sequence[float] | None = None,
         threads: int = 0,
-        scene_file: str = SCENE_FILE,
+        scene_file: str | Path = SCENE_FILE,
         ends: Ends | None = None,
         contact: str | None = None,
         change: Change | None = None,
@@ -43,13 +43,15 @@ class DeployStage:
     ) -> None:
         """Load the export in ``folder``.
 
-        ``command`` (C,) applies when ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
+        ``scene_file``: see Fleet. ``command`` (C,) applies when ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
         ``change``, ``whole`` and ``each``: see Fleet. ``edited``: see read_contract.
         ``contact``: the policy sees the velocity of leg odometry with this contact detection; None: the true velocity.
         """
         contract = read_contract(folder, edited)
-        self.contract = replace(contract, ends=ends or contract.ends)
-        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, whole, change, each)
+        self.fleet = Fleet(
+            folder, replace(contract, ends=ends or contract.ends), num_worlds, threads, scene_file, whole, change, each
+        )
+        self.contract = self.fleet.contract
         self.controller = Controller(folder, self.contract, num_worlds)
         self.odometry = Odometry(folder, self.contract, num_worlds, contact) if contact else None
         self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period

@@ -62,6 +62,13 @@ NOMINAL = {  # overrides of the trained config for playing
 ROWS, BORDER = 3, 2.0  # of the terrain: levels from the easiest to the hardest, border [m]
 
 
+OF_THE_EXAM = {
+    "compare": "grades two policies side by side",
+    "ranges": "says what the exam asks",
+    "no_hard": "leaves a part of the exam out",
+}
+
+
 def parse(description: str | None) -> argparse.Namespace:
     """Parse the flags of play."""
     parser = make_parser(description)
@@ -103,12 +110,9 @@ def parse(description: str | None) -> argparse.Namespace:
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
-    if args.compare is not None and not args.eval:
-        parser.error("--compare grades two policies side by side: add --eval")
-    if args.ranges and not args.eval:
-        parser.error("--ranges says what the exam asks: add --eval")
-    if args.no_hard and not args.eval:
-        parser.error("--no_hard leaves a part of the exam out: add --eval")
+    for name, why in OF_THE_EXAM.items():
+        if getattr(args, name) not in (None, False) and not args.eval:
+            parser.error(f"--{name} {why}: add --eval")
     if args.follow and (args.eval or args.export or args.checkpoint != -1):
         parser.error("--follow watches the newest policy: leave --eval, --export and --checkpoint out")
     if args.export and (args.set or args.override or args.command is not None):
