@@ -336,7 +336,7 @@ def test_a_new_task_checks_and_trains(
     assert "guessed: feet: " in out and "python train.py --task " in out
     robot, config = tmp_path / "made" / "mine.xml", tmp_path / "made" / "mine_flat.py"
     text = config.read_text()
-    assert len(text.splitlines()) <= 80 and text.count("LOOK") >= 4
+    assert len(text.splitlines()) <= 95 and text.count("LOOK") >= 4
     assert str(ROOT) not in robot.read_text() + text and str(tmp_path) not in robot.read_text() + text
     moved = tmp_path / "moved"
     (tmp_path / "made").rename(moved)
@@ -380,10 +380,11 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert health_of(found, bare).stand.end == "stands"
     text = config_text(found, GO1, "my_go")
     assert (
-        "class MyGoFlatCfg(LeggedRobotCfg):" in text
-        and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
+        "class MyGoFlatCfg(SimToRealCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
     )
-    assert "(quadruped, 12 joints; " in text and "effort" not in text
+    assert "(quadruped, 12 joints; " in text and "# effort = " not in text
+    simple = config_text(draft(bare, simple=True), GO1, "my_go")
+    assert "class MyGoFlatCfg(LeggedRobotCfg):" in simple and "delay_ms" in text and "delay_ms" not in simple
     biped = config_text(draft(TOY), TOY, "toy", mirrors=True)
     assert (
         "class ToyFlatCfg(BipedCfg):" in biped

@@ -49,6 +49,10 @@ LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 # of the solver under implicitfast [ours: with 1 and 5 no robot stands, with 3 and 5 one of four falls]
 IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
+# reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
+# soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
+LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.5}
+LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "pose": 1.0, "action_rate": -0.02, "feet_orientation": -1.0}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
@@ -67,9 +71,10 @@ class Draft(NamedTuple):
     maker: Maker | None  # what its maker publishes, if that is known
     gains_from: str  # source of the gains, as text
     judged: list[Judged]  # the poses that were judged, the chosen one first
+    simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
 
 
-def draft(file: Path) -> Draft:
+def draft(file: Path, simple: bool = False) -> Draft:
     """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF)."""
     read = read_robot(file)
     from_file = read.keyframe is not None
@@ -101,7 +106,8 @@ def draft(file: Path) -> Draft:
     ]
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker, gains_from, judged)
+    notes = [*read.notes, *more]
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple)
 
 
 def _servos(
@@ -178,10 +184,12 @@ def as_env(found: Draft, file: Path) -> LeggedRobot:
 
 def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]]:
     """The base classes of the task's configs."""
+    if len(found.feet) != 2 and found.simple:
+        return LeggedRobotCfg, LeggedRobotCfgPPO
+    presets = import_task(ROOT / "configs/base.py")
     if len(found.feet) == 2:
-        presets = import_task(ROOT / "configs/base.py")
         return presets.BipedCfg, presets.BipedCfgPPO
-    return LeggedRobotCfg, LeggedRobotCfgPPO
+    return presets.SimToRealCfg, presets.SimToRealCfgPPO
 
 
 def has_mirror(env: LeggedRobot) -> bool:
@@ -210,7 +218,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),
-            "action_scale": 0.5,
+            "action_scale": _action_scale(found),
         },
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
@@ -218,9 +226,27 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
         chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
+    if chosen["control"]["action_scale"] < 0.5:
+        chosen["normalization"] = {"clip_actions": 4.0}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
-    return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+    if found.simple:
+        return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+    weights = table(pose_weights(found.robot, found.pose, found.feet), names)
+    rewards = {**low, "pose_weights": weights, "scales": dict(LOOKS)}
+    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "rewards": rewards}
+
+
+def _action_scale(found: Draft) -> float:
+    """How far an action of 1 moves a joint [rad]: less where 0.5 rad ask for more than 0.7 of most motors' effort."""
+    asked = sorted(gain.kp / joint.effort for gain, joint in zip(found.gains, found.joints, strict=True))
+    return 0.5 if 0.5 * asked[len(asked) // 2] <= 0.7 else 0.25
+
+
+def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
+    """Randomized worlds: what differs with the robot's size, and delays. ``shares`` of the mass, on the root."""
+    mass = float(found.robot.physics.body_subtreemass[0])
+    return {"base_mass": [round(share * mass, 2) for share in shares], "delay_ms": [0.0, 15.0]}
 
 
 def _motors(found: Draft) -> dict[str, dict[str, float]]:
@@ -234,21 +260,26 @@ def _motors(found: Draft) -> dict[str, dict[str, float]]:
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Further values for a biped: they replace BipedCfg's numbers of a G1, and simplify training on a few cores."""
-    robot, mass = found.robot, float(found.robot.physics.body_subtreemass[0])
+    """Further values for a biped: they replace BipedCfg's numbers of a G1; a simple task leaves out what is hard."""
+    robot = found.robot
     data = posed(robot.physics, found.pose)
     left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
+    rewards: dict[str, Any] = {
+        **low,
+        "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
+        "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
+        "scales": {"contact_phase": 1.0, "no_fly": 0.5, **({} if found.simple else LOOKS_OF_A_BIPED)},
+    }
+    worlds = _worlds(found, (-0.03, 0.06))
+    if not found.simple:
+        ranges = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1.0, 1.0]}
+        return {"commands": {"ranges": ranges}, "domain_rand": worlds, "rewards": rewards}
     return {
         "commands": {"ranges": {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}},
         "observations": {"leave_out": {}},
-        "domain_rand": {"enable": False, "base_mass": [round(share * mass, 2) for share in (-0.03, 0.06)]},
+        "domain_rand": {"enable": False, "base_mass": worlds["base_mass"]},
         "perturbation": {"push": False, "velocity": [0.0, 4.0]},
-        "rewards": {
-            **low,
-            "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
-            "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
-            "scales": {"contact_phase": 1.0, "no_fly": 0.5},
-        },
+        "rewards": rewards,
     }
 
 
@@ -349,18 +380,26 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
 
 
-# ---- a biped's weights of the pose reward
+# ---- weights of the pose reward
 
-WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # from configs/g1_flat.py
+# from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
+WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
+KNEE_WALKS = 0.1  # on more feet, where all other joints have 1 [MuJoCo Playground]
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
-    """Weights (D,) of a biped's pose reward: smallest for hip and knee, small for the ankle, large for all others."""
+    """Weights (D,) of the pose reward: smallest for what walks (hip and knee; on more than two feet the knee alone)."""
     model, data = robot.physics, posed(robot.physics, pose)
-    weights = [HELD] * len(robot.joint_names)
+    weights = [QUIET if len(feet) == 2 else 1.0] * len(robot.joint_names)
     for foot in feet:
         legs = joints_to(model, foot)
         sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
+        if len(feet) != 2:
+            for joint in sideways[1:2]:
+                weights[joint - 1] = KNEE_WALKS
+            continue
+        for joint in legs:
+            weights[joint - 1] = HELD
         for joint in sideways[:2]:
             weights[joint - 1] = WALKS
         for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
