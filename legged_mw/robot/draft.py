@@ -52,7 +52,9 @@ FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
 # reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
 # soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
-LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.5}
+LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25}
+# of `energy`, per kilogram: BipedCfg's -0.002 of a G1 of 35 kg, Playground's -0.001 of a Go1 of 13 kg
+ENERGY = {2: -0.07, 4: -0.013}
 LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "pose": 1.0, "action_rate": -0.02, "feet_orientation": -1.0}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
@@ -219,7 +221,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),
-            "action_scale": _action_scale(found),
+            "action_scale": 0.5 if found.simple else 0.25,
         },
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
@@ -227,21 +229,21 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
         chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
-    if chosen["control"]["action_scale"] < 0.5:
+    if not found.simple:
         chosen["normalization"] = {"clip_actions": 4.0}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
     if found.simple:
         return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
-    rewards = {**low, "pose_weights": weights, "scales": dict(LOOKS)}
+    rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
     return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "rewards": rewards}
 
 
-def _action_scale(found: Draft) -> float:
-    """How far an action of 1 moves a joint [rad]: less where 0.5 rad ask for more than 0.7 of most motors' effort."""
-    asked = sorted(gain.kp / joint.effort for gain, joint in zip(found.gains, found.joints, strict=True))
-    return 0.5 if 0.5 * asked[len(asked) // 2] <= 0.7 else 0.25
+def _energy(found: Draft) -> dict[str, float]:
+    """The scale of `energy`: a heavier robot needs more power to walk as fast."""
+    mass = float(found.robot.physics.body_subtreemass[0])
+    return {"energy": float(f"{ENERGY.get(len(found.feet), ENERGY[4]) / mass:.2g}")}
 
 
 def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
@@ -269,7 +271,11 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
         **low,
         "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
         "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
-        "scales": {"contact_phase": 1.0, "no_fly": 0.5, **({} if found.simple else LOOKS_OF_A_BIPED)},
+        "scales": {
+            "contact_phase": 1.0,
+            "no_fly": 0.5,
+            **({} if found.simple else {**LOOKS_OF_A_BIPED, **_energy(found)}),
+        },
     }
     worlds = _worlds(found, (-0.03, 0.06))
     if not found.simple:

@@ -71,6 +71,7 @@ _COMMENTS = {
     "feet_impact_vel": "no stamping",
     "pose": "arms and waist quiet",
     "feet_orientation": "soles level",
+    "energy": "by its mass",
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
     "pose_weights": "how near the default pose each joint is to stay",
     "contact_phase": "one foot after the other; without it and no_fly a beginner hops [ours: docs/lab.md]",
