@@ -99,7 +99,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     ]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
-    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
+    comments = {**_COMMENTS, "held_joints": _held(found), "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
     for section, fields in sections.items():
         lines += [f"    class {section}({base}.{section}):"]
         for field, value in fields.items():
@@ -153,6 +153,11 @@ def _force_limits(found: Draft) -> list[str]:
     some = f"{endless[0]} and {len(endless) - 1} more" if endless[1:] else endless[0]
     some = "all joints" if len(endless) == len(found.joints) else some
     return [f'        # effort = {{"": 30.0}}  # [N m] LOOK: the file has no force limit for {some}; write yours']
+
+
+def _held(found: Draft) -> str:
+    every = len(found.angles)
+    return f"LOOK: {len(found.held)} joints that do not walk; without this line the task has {every} actions"
 
 
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
