@@ -23,6 +23,7 @@ from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 if TYPE_CHECKING:
     from legged_mw.eval.exams import Graded
+    from legged_mw.eval.report import Column
 
 
 def start_quickly(gpu: str | None = "cpu") -> None:
@@ -105,7 +106,7 @@ def play() -> None:
     if args.eval:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         policies = [(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)]
-        exams.grade(policies, args, grade_export)
+        exams.grade(policies, args, lambda graded: grade_export(graded, not args.no_hard))
         return
     if args.export:
         check_classes(trained.train)
@@ -115,10 +116,14 @@ def play() -> None:
     playing.watch(source, *playing.prepare(source, trained, args), args)
 
 
-def grade_export(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
-    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
+def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
+    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it.
+
+    ``hard``: the hard exam too, where the task walks.
+    """
     from legged_mw.deploy.exam import run
     from legged_mw.envs.domain_rand import active
+    from legged_mw.eval.report import Column
 
     task = graded.task
     if active(task.cfg):
@@ -126,8 +131,10 @@ def grade_export(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
         return []
     with TemporaryDirectory() as folder:
         try:
-            export(task, graded.source.checkpoint, Path(folder) / "export")
-            return [("the same, deployed in MuJoCo", run(Path(folder) / "export", graded.exam.rules(task)))]
+            made = Path(folder) / "export"
+            export(task, graded.source.checkpoint, made)
+            result, strip = run(made, graded.exam.rules(task), hard)
+            return [Column("the same, deployed in MuJoCo", {}, result, strip=strip)]
         except UserError as error:  # a row that nobody can measure, no onnxruntime
             print(f"not graded through an export: {error}")
             return []

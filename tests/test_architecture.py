@@ -105,6 +105,7 @@ NEVER_IN = {
     # numbers in, numbers out: of use to whoever drives the robot otherwise
     "legged_mw/eval/walking.py": ["torch", "mujoco"],
     "legged_mw/eval/figures.py": ["torch", "mujoco"],
+    "legged_mw/eval/hard.py": ["torch", "mujoco"],
     "legged_mw/eval/skill*.py": ["torch", "legged_mw.envs", "legged_mw.rl", "legged_mw.eval.perform"],
     "legged_mw/view/*": [
         "torch",
@@ -143,6 +144,7 @@ DEPLOY_MAY = [
         "legged_mw.unitree",
         "legged_mw.view",
         "legged_mw.eval.walking",
+        "legged_mw.eval.hard",
         "legged_mw.eval.skills",
     ),
     *(

@@ -133,7 +133,7 @@ BUDGETS: dict[str, tuple[Callable[[], Callable[[], object]], int, int]] = {
     "a motor's torque": (a_torque, 2, 6),
     "a row of observations": (rows, 2, 6),
     "an iteration of PPO, without its steps": (an_iteration, 4, 13),
-    "a checkpoint saved and resumed": (a_checkpoint, 4, 13),
+    "a checkpoint saved and resumed": (a_checkpoint, 3, 12),
     "the walking exam, without its steps": (an_exam, 6, 19),
 }
 

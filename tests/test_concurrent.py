@@ -23,11 +23,10 @@ from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export.network import run_onnx
-from legged_mw.rl.policies import act, find_trained, load_policy
+from legged_mw.rl.policies import act, attach_teacher_observations, begin_with, find_trained, load_policy, load_teacher
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, pick_teacher_worlds
-from legged_mw.rl.transfer import attach_teacher_observations, begin_with, load_teacher
 from legged_mw.utils.task import LoadedTask
 
 TAUGHT = {

@@ -8,6 +8,7 @@ import os
 import pickle
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Optional
 
@@ -727,13 +728,16 @@ TASK = Task(LeggedRobot, FastCfg, LeggedRobotCfgPPO)
 
 
 @pytest.fixture
-def no_configs(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_configs() -> Iterator[None]:
     """As for an installed package: nothing on the path has the name."""
-    for name in [name for name in sys.modules if name.partition(".")[0] == "configs"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(sys, "path", [place for place in sys.path if not (Path(place) / "configs").is_dir()])
-    monkeypatch.chdir("/")
-    importlib.invalidate_caches()
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "configs"]:
+            patch.delitem(sys.modules, name)
+        patch.setattr(sys, "path", [place for place in sys.path if not (Path(place) / "configs").is_dir()])
+        patch.chdir("/")
+        importlib.invalidate_caches()
+        yield
+    importlib.invalidate_caches()  # the way to the package `tests` is known again
 
 
 def test_a_task_finds_configs_where_nothing_else_has_them(no_configs: None, tmp_path: Path) -> None:
@@ -763,13 +767,12 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
     assert load_task("go1_flat").cfg.noise.level == 1.0  # by name it is the package's own
 
 
-def test_another_packages_name_configs_is_given_back(
-    no_configs: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_packages_name_configs_is_given_back(no_configs: None, tmp_path: Path) -> None:
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/__init__.py").write_text("")
     (tmp_path / "configs/mine.py").write_text("VALUE = 3\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.path.insert(0, str(tmp_path))  # of no_configs; syspath_prepend would restore that list, not the real one
+    importlib.invalidate_caches()
     first = load_task("go1_flat_dr")  # before anybody imported it
     mine = importlib.import_module("configs.mine")
     assert mine.VALUE == 3

@@ -723,7 +723,9 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(place, "EXAM_SECONDS", 2.1)
     monkeypatch.setattr(plots, "sections", lambda *_: [])  # drawn in test_report
     folder = trained(tmp_path, "--max_iterations", "1")
-    result = run("play", tmp_path, *SMALL[:2], "--device", "cpu", "--eval", "--set", "terrain.friction=0.4")
+    result = run(
+        "play", tmp_path, *SMALL[:2], "--device", "cpu", "--eval", "--no_hard", "--set", "terrain.friction=0.4"
+    )
     assert result.code == 0, result.err
     assert "terrain.friction: 0.6 -> 0.4" in result.out and "noise.level: 1.0 -> 0.0" in result.out
     assert "falls in 22 commands" in result.out and "walks: no; beats the peer: no" in result.out
@@ -748,7 +750,7 @@ def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     monkeypatch.setattr(plots, "sections", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")
-    start = [*SMALL[:2], "--device", "cpu", "--eval"]
+    start = [*SMALL[:2], "--device", "cpu", "--eval", "--no_hard"]
     result = run("play", tmp_path, *start, "--set", "exam.ranges={lin_vel_x: [0, 0.9]}")
     assert result.code == 0, result.err
     assert result.out.count("walks: no\n") == 1 and "peer" not in result.out

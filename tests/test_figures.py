@@ -100,6 +100,17 @@ def test_responses_to_each_step() -> None:
     )
 
 
+def test_estimates_beside_the_truth_in_the_last_seconds() -> None:
+    """Three worlds of five steps, of which two count; the second world fell."""
+    time, world = np.arange(5.0)[:, None], np.array([0.0, 10.0, 20.0])
+    truth = np.stack([time + world, -time - world, np.full((5, 3), 9.0)], axis=2)
+    record = make(3, 5, fell={1: 3}, velocity=truth, estimate=truth[..., :2] + 0.5)
+    found = figures.estimates(record, [(0.8, 0.0), (0.0, 0.5), (0.0, 0.0)], seconds=2 * DT)
+    assert found["commands"] == [[0.8, 0.0], [0.0, 0.5], [0.0, 0.0]] and found["seconds"] == 2 * DT
+    assert found["truth"] == [[3, 4, None, None, 23, 24], [-3, -4, None, None, -23, -24]]
+    assert found["estimate"][0] == [3.5, 4.5, None, None, 23.5, 24.5]
+
+
 # ---- gait
 
 

@@ -22,12 +22,11 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.snapshot import take_snapshot
 from legged_mw.eval.rollout import TrainingExam
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
-from legged_mw.rl.policies import PolicySource, Trained
+from legged_mw.rl.policies import PolicySource, Trained, attach_teacher_observations
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.students.recurrent import memory_of
-from legged_mw.rl.transfer import attach_teacher_observations
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 

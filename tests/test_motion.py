@@ -17,7 +17,18 @@ from legged_mw.motion.foreign import breadth_first, read_motion
 from legged_mw.motion.look import page
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.skills.clip import Clip, ClipError, checked, from_rotation_vector, read_clip, save_clip
+from legged_mw.skills.clip import (
+    Clip,
+    ClipError,
+    checked,
+    from_rotation_vector,
+    heading,
+    multiply,
+    read_clip,
+    rotate,
+    rotation_vector,
+    save_clip,
+)
 from legged_mw.skills.kinematics import Kinematics
 from legged_mw.utils.task import load_task
 
@@ -44,12 +55,27 @@ def steady(fps: float = 30.0, frames: int = 31) -> Clip:
 
 
 def test_a_clip_at_another_rate_is_the_same_motion() -> None:
+    assert steady(frames=2).seconds == pytest.approx(1 / 30)  # two frames are enough
     clip = steady().at(50.0)
     assert len(clip.root_pos) == 51 and clip.seconds == pytest.approx(1.0)
     for ours, right in zip(clip[2:], steady(50.0, 51)[2:], strict=True):
         np.testing.assert_allclose(ours, right, atol=1e-9)
     # turning is in the body's frame
     np.testing.assert_allclose(clip.qvel(), np.tile([1.0, 0, 0, *(2 * AXIS), 3.0], (51, 1)), atol=1e-9)
+
+
+def test_rotations_by_hand() -> None:
+    """A quarter turn, the way there and back, the shorter way round, and the heading of a body that also leans."""
+    yaw, roll = (from_rotation_vector(np.array(v)) for v in ([0.0, 0.0, np.pi / 2], [0.3, 0.0, 0.0]))
+    np.testing.assert_allclose(rotate(yaw, np.array([2.0, 0.0, 5.0])), [0.0, 2.0, 5.0], atol=1e-12)
+    np.testing.assert_allclose(rotate(roll, np.array([7.0, 1.0, 0.0])), [7.0, np.cos(0.3), np.sin(0.3)], atol=1e-12)
+    for angle in (1e-12, 0.3, 3.0):
+        turn = from_rotation_vector(angle * AXIS)
+        for same in (turn, -turn):
+            np.testing.assert_allclose(rotation_vector(same), angle * AXIS, rtol=1e-9)
+    np.testing.assert_allclose(rotation_vector(from_rotation_vector(4.0 * AXIS)), (4.0 - 2 * np.pi) * AXIS, rtol=1e-9)
+    np.testing.assert_allclose(heading(multiply(yaw, roll)), yaw, atol=1e-12)
+    np.testing.assert_allclose(heading(roll), [1.0, 0.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_signs_of_quaternions_do_not_jump(tmp_path: Path) -> None:

@@ -320,7 +320,7 @@ def test_compare_grades_each_by_its_own_config(
     monkeypatch.setitem(exams.EXAMS, "walking", kind)
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
-    result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", *small)
+    result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", "--no_hard", *small)
     assert result.code == 0, result.err
     folder, task, one, other = written
     assert folder == first / "eval" and task == "go1_flat"
@@ -359,7 +359,17 @@ def test_a_rival_that_does_not_fit_is_refused(
     config.write_text(json.dumps(saved))
     try:
         text = refused(
-            root, "play", *SMALL[:2], "--device", "cpu", "--eval", "--load_run", first.name, "--compare", second.name
+            root,
+            "play",
+            *SMALL[:2],
+            "--device",
+            "cpu",
+            "--eval",
+            "--no_hard",
+            "--load_run",
+            first.name,
+            "--compare",
+            second.name,
         )
     finally:
         config.write_text(kept)

@@ -329,25 +329,3 @@ def test_variants_step(name: str) -> None:
         obs, rewards, *_ = env.step(torch.randn(4, 12))
         assert obs["state"].shape == (4, 42) and obs["state"].isfinite().all() and rewards.isfinite().all()
     assert env.mirror is not None
-
-
-@pytest.mark.parametrize(
-    ("task", "path", "value", "line"),
-    [
-        ("go1_getup", "falls.share", 1.5, "falls.share is 1.5; it must be from 0 to 1"),
-        ("go1_getup", "falls.states", 0, "falls.states is 0; it must be 1 or more"),
-        ("go1_getup", "falls.pull", -1.0, "falls.pull is -1.0; it must be from 0 to 1"),
-        ("go1_getup", "terrain.slope", 80.0, "terrain.slope is 80.0; it must be from -60 to 60 degrees"),
-        ("go1_handstand", "exam.nose", 0.0, "exam.nose is 0.0; it must be 1 or -1"),
-        ("go1_handstand", "exam.hands", [], "exam.hands is []; it must be a list of at least one"),
-        (
-            "go1_handstand",
-            "exam.hands",
-            ["FX"],
-            "exam.hands: no geom 'FX' in resources/robots/go1/go1.xml; there are: floor, ",
-        ),
-    ],
-)
-def test_bad_values(task: str, path: str, value: Any, line: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(line)):
-        make(task, **{path.replace(".", "__"): value, "env__num_envs": 1})

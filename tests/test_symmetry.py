@@ -125,6 +125,17 @@ def test_a_joint_may_have_a_partner_within_a_tolerance(tmp_path: Path) -> None:
     assert find_partners(apart, tolerance=0.006).joints[:6] == (3, 4, 5, 0, 1, 2)
 
 
+def test_the_axis_of_a_partner_may_be_tilted_a_little(tmp_path: Path) -> None:
+    joint = '<joint name="FL_calf_joint" class="calf"'
+    for tilt in (0.02, 0.008):  # [rad], beyond what is allowed and within it
+        tilted = load_robot(tmp_path / "go1.xml", replaced(GO1, joint, f'{joint} axis="{tilt} 1 0"', 1))
+        if tilt > 0.01:
+            with pytest.raises(ModelError):
+                find_partners(tilted)
+    assert find_partners(tilted).joints[:6] == (3, 4, 5, 0, 1, 2)
+    assert find_partners(tilted).signs[:6] == (-1, 1, 1, -1, 1, 1)
+
+
 # ---- observations and actions
 
 

@@ -21,17 +21,20 @@ from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy.contract import read_contract
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.policies import PolicySource, Trained, find_trained, load_policy
-from legged_mw.rl.run_folder import update_from_run
-from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import (
+from legged_mw.rl.policies import (
     TEACHER,
+    PolicySource,
+    Trained,
     attach_teacher_observations,
     begin_with,
     check_start,
+    find_trained,
     keep_teacher,
+    load_policy,
     load_teacher,
 )
+from legged_mw.rl.run_folder import update_from_run
+from legged_mw.rl.runner import make_runner
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 

@@ -15,7 +15,7 @@ import torch
 from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.terrain import build_terrain
-from legged_mw.sim.ground import as_boxes
+from legged_mw.sim.ground import Ground, add_ground, as_boxes, leaning, replace_level_pieces
 from legged_mw.sim.height_map import HeightMap
 from legged_mw.sim.terrain import (
     KINDS,
@@ -80,6 +80,27 @@ def test_stairs_are_stairs() -> None:
             assert along[round(PLATFORM / 0.1)] == along[0]
 
 
+def test_each_kind_is_as_high_and_wide_as_it_says() -> None:
+    """Tiles of 8 m at full difficulty, level within 1 m of the middle and in the last 0.5 m."""
+    grid, rng = Grid(80, 0.1, pit=False), np.random.default_rng(0)
+    hard = {name: kind(grid, 1.0, rng) for name, kind in KINDS.items()}
+    found = {name: (hard[name].min().round(6), hard[name].max().round(6)) for name in hard}
+    assert found["smooth_slope"] == (0.0, 0.4 * 2.5) and found["gap"] == (-0.5, 0.0)
+    assert np.abs(np.diff(hard["smooth_slope"], axis=0)).max() == pytest.approx(0.04)
+    assert set(np.unique(hard["obstacles"])) == {-0.25, -0.125, 0.0, 0.125, 0.25}
+    assert set(np.unique(hard["stepping_stones"])) == {-0.3, 0.0}
+    noise = hard["rough_slope"] - hard["smooth_slope"]
+    for rough, low, high in ((noise, -0.05, 0.05), (hard["waves"], -0.15, 0.15), (hard["low_random"], 0.0, 0.05)):
+        assert low <= rough.min() <= low + 0.03 and high - 0.03 <= rough.max() <= high
+    wave = hard["waves"][10]  # 2 m long
+    assert np.ptp(wave[10:30]) > 0.1 and wave[10:50] == pytest.approx(wave[30:70])
+    assert KINDS["low_random"](grid, 0.5, rng).max() <= 0.025
+    assert np.flatnonzero(hard["gap"][40]).tolist() == [*range(24, 30), *range(51, 57)]  # 0.6 m behind the platform
+    holes = hard["stepping_stones"][10] < 0.0  # stones of 0.3 m, gaps of 0.2 m
+    edges = np.flatnonzero(np.diff(holes[5:76].astype(int)))
+    assert set(np.diff(edges)[1:-1]) == {2, 3}
+
+
 def test_slopes_go_up_and_down_in_turn() -> None:
     """Along a column, and side by side: two columns of a kind have one of each at every level."""
     ground = terrain(proportions={"smooth_slope": 1.0, "rough_slope": 1.0}, columns=4)
@@ -97,25 +118,40 @@ def test_columns_are_shared_out() -> None:
     assert share_columns({"flat": 100.0, "gap": 1.0, "waves": 0.0}, 5) == ("flat",) * 4 + ("gap",)
 
 
-@pytest.mark.parametrize("cell", [0.1, 0.05])
-def test_a_lookup_is_what_a_ray_hits(cell: float) -> None:
-    ground = terrain(levels=2, cell=cell)
-    low, high = ground.span()
-    rows, columns = ground.heights.shape
-    spec = mujoco.MjSpec()
-    size = [(columns - 1) * cell / 2, (rows - 1) * cell / 2, high - low, 1.0]
-    spec.add_hfield(
-        name="ground", size=size, nrow=rows, ncol=columns, userdata=((ground.heights - low) / (high - low)).ravel()
-    )
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=[0, 0, low])
+def drop_rays(spec: mujoco.MjSpec, points: np.ndarray) -> list[float]:
+    """Heights [m] that rays straight down hit at ``points`` (n, 2)."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    hit, down = np.zeros(1, dtype=np.int32), np.array([0.0, 0.0, -1.0])
+    return [5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), down, None, 1, -1, hit) for p in points]
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.05])
+def test_a_lookup_is_what_a_ray_hits(cell: float) -> None:
+    ground, spec = terrain(levels=2, cell=cell), mujoco.MjSpec()
+    add_ground(spec, Ground(terrain=ground), [])
     points = np.random.default_rng(0).uniform(ground.corner, [-c for c in ground.corner], (1000, 2))
-    hit = np.zeros(1, dtype=np.int32)
-    down = np.array([0.0, 0.0, -1.0])
-    rays = [5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), down, None, 1, -1, hit) for p in points]
+    rays = drop_rays(spec, points)
     np.testing.assert_allclose(HeightMap(ground, "cpu")(torch.tensor(points, dtype=torch.float)), rays, atol=1e-4)
+
+
+def test_a_ray_hits_boxes_where_the_vertices_are() -> None:
+    """Level pieces as boxes, the rest as a height field, for which few iterations become more."""
+    ground, spec = terrain(levels=2), mujoco.MjSpec()
+    spec.option.iterations, spec.option.ls_iterations = 1, 60
+    add_ground(spec, Ground(terrain=ground), [])
+    replace_level_pieces(spec, ground, [])
+    assert (spec.option.iterations, spec.option.ls_iterations) == (20, 60)
+    rng, (rows, columns) = np.random.default_rng(0), ground.heights.shape
+    row, column = rng.integers(0, rows, 1000), rng.integers(0, columns, 1000)
+    rays = drop_rays(spec, np.array(ground.corner) + 0.1 * np.column_stack([column, row]))
+    np.testing.assert_allclose(rays, ground.heights[row, column], atol=1e-4)
+
+
+def test_gravity_leans_ahead_on_a_slope() -> None:
+    """By 30 degrees: half of it along x, the root of 3/4 down."""
+    assert leaning([0.0, 0.0, -10.0], 30.0) == pytest.approx([5.0, 0.0, -10.0 * 0.75**0.5])
 
 
 def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
@@ -124,6 +160,20 @@ def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
     with recordable():
         found = heights(points)
     assert found.shape == (2, 2) and found[:, 0].tolist() == [0.0, 0.0]
+
+
+def test_a_lookup_by_hand_at_the_rim_and_beyond() -> None:
+    """Squares of the vertices' numbers: no two neighbours differ alike, so a vertex beside the right one is seen."""
+    field = np.arange(12.0).reshape(3, 4) ** 2
+    nowhere = {"tile": 1.0, "kinds": (), "difficulties": (), "origins": np.zeros((0, 0, 3))}
+    look_up = HeightMap(Terrain(heights=field, cell=0.5, corner=(1.0, -2.0), **nowhere), "cpu")
+    column, row = np.meshgrid(np.arange(-2, 7), np.arange(-2, 6))
+    points = np.stack([1.0 + 0.5 * column, -2.0 + 0.5 * row], axis=-1)
+    expected = field[row.clip(0, 2), column.clip(0, 3)]
+    np.testing.assert_array_equal(look_up(torch.tensor(points, dtype=torch.float)), expected)
+    # in the last cell, of heights 36 49, 100 121: 3/4 across and 1/4 along, then the other way round
+    inside = torch.tensor([[2.375, -1.375], [2.125, -1.125], [torch.nan, torch.nan]])
+    assert look_up(inside).tolist() == [36 + 0.75 * 13 + 0.25 * 72, 36 + 0.75 * 64 + 0.25 * 21, 0.0]
 
 
 # ---- kinds of one's own

@@ -20,7 +20,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged_mw import ROOT, programs
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import training
-from legged_mw.rl.checkpoint import load_tensors, save_whole
+from legged_mw.rl.run_folder import load_tensors, save_whole
 from legged_mw.rl.runner import Runner
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import completion, doctor, sweep, warm

@@ -415,7 +415,7 @@ KILLED = """
 import os, random, signal, sys, time
 from pathlib import Path
 import torch
-from legged_mw.rl.checkpoint import save_whole
+from legged_mw.rl.run_folder import save_whole
 
 torch.set_num_threads(1)
 folder, dice = Path(sys.argv[1]), random.Random(0)

@@ -165,7 +165,7 @@ SAID = {
     "a1_style": [
         "fused into 'base', to which they are fixed: trunk, imu_link",
         "looks left out (no such file): package://a1_style_description/meshes/imu.stl",
-        "inertia of 'imu_link' balanced: no body has the moments 1e-06, 1e-06, 0.0002 kg m^2, so each becomes their mean",
+        "inertia of 'imu_link' balanced: no body has the moments 1e-06, 1e-06, 0.0002 kg m^2; now 6.71e-05, 6.71e-05, 0.000134",
         "FR_hip_joint armature: 0 -> 0.01 kg m^2",
         "FR_hip_joint damping: 0.01 -> 0.5 N m s/rad",
     ],

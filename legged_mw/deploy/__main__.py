@@ -12,11 +12,13 @@ from legged_mw.deploy import drive, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, edits, read_contract
 from legged_mw.deploy.drive import lift
 from legged_mw.deploy.exam import SwitchStage, contract_skill, run_exam, run_skill
+from legged_mw.deploy.hard_exam import run_hard
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import walking
+from legged_mw.eval.hard import table
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import check_folder, typed, writable
@@ -143,6 +145,7 @@ def parse() -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
+    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam, in a third of the time")
     parser.add_argument(
         "--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name"
     )
@@ -153,6 +156,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it"
     )
+    scene = (
+        "run and grade it in this MJCF of yours, such as a vendor's own: joints by name, servos by the policy's gains"
+    )
+    parser.add_argument("--scene", metavar="FILE", help=scene)
     parser.add_argument(
         "--edited",
         action="store_true",
@@ -164,25 +171,35 @@ def parse() -> argparse.Namespace:
     args = parser.parse_args()
     if args.folder is None and args.replay is None:
         parser.error("the following arguments are required: DIR")
-    if args.eval and (
-        asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
-    ):
-        parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
-    if (args.second is None) != (args.switch is None):
-        parser.error("--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
-    others = [f"--{name}" for name in ("eval", "drive", "serve", "terrain", "velocity") if getattr(args, name)]
-    if args.switch and (others := others + ["--robot"] * (args.robot != "simulated")):
-        parser.error(f"--switch is watched in simulation, on flat ground: leave {others[0]} out")
-    if args.ranges and not args.eval:
-        parser.error("--ranges says what the exam asks: add --eval")
-    if args.command is not None and args.commands:
-        parser.error("--commands brings its own commands: leave --command out")
+    _refuse(parser, args)
     if args.out is not None:
         writable(args.out, "--out")
     launch.check_flags(args)
     check_flags(args)
     drive.check_flags(args)
     return args
+
+
+def _refuse(parser: Parser, args: argparse.Namespace) -> None:
+    """Refuse flags of the exam, of a scene and of two policies that do not go together."""
+    if args.eval and (
+        asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
+    ):
+        parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
+    if (args.second is None) != (args.switch is None):
+        parser.error("--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
+    others = [f"--{name}" for name in ("eval", "drive", "serve", "terrain", "velocity", "scene") if getattr(args, name)]
+    if args.switch and (others := others + ["--robot"] * (args.robot != "simulated")):
+        parser.error(f"--switch is watched in simulation, on flat ground: leave {others[0]} out")
+    if args.ranges and not args.eval:
+        parser.error("--ranges says what the exam asks: add --eval")
+    apart = [f"--{name}" for name in ("drive", "serve", "terrain", "velocity", "replay") if getattr(args, name)]
+    if args.scene and (apart := apart + ["--robot"] * (args.robot != "simulated")):
+        parser.error(f"--scene is of a simulated robot in a world of yours: leave {apart[0]} out")
+    if args.no_hard and not args.eval:
+        parser.error("--no_hard leaves a part of the exam out: add --eval")
+    if args.command is not None and args.commands:
+        parser.error("--commands brings its own commands: leave --command out")
 
 
 def main() -> None:
@@ -193,7 +210,8 @@ def main() -> None:
         show_log(args.replay, find(args.folder) if args.folder else None, args.edited)
         return
     folder = find(args.folder)
-    contract, scene_file = read_contract(folder, args.edited), TERRAIN_FILE if args.terrain else SCENE_FILE
+    contract, inside = read_contract(folder, args.edited), TERRAIN_FILE if args.terrain else SCENE_FILE
+    scene_file = typed(args.scene) if args.scene else inside
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
@@ -209,16 +227,18 @@ def main() -> None:
         print(robot.report)
     elif args.drive:
         robot = MujocoRobot(
-            folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args)
+            folder, contract, inside, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args)
         )
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
         examine(
             folder,
-            Path(args.out) if args.out else results(folder) / RESULT_FILE,
+            Path(args.out) if args.out else results(folder) / result_file(args.scene),
             args.ranges == "common",
             contact,
             args.edited,
+            hard=not args.no_hard,
+            scene=scene_file,
         )
     else:
         stage = DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact, edited=args.edited)
@@ -240,6 +260,11 @@ def results(folder: Path) -> Path:
     return Path("logs", folder.name, "shipped") if folder.resolve().parent == SHIPPED.resolve() else folder
 
 
+def result_file(scene: str | None) -> str:
+    """The file of the exam: by the scene's name in a scene of the user's."""
+    return f"exam_{Path(scene).stem}.json" if scene else RESULT_FILE
+
+
 def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
     """Compare a log with its simulation: print the table and write a plot beside the log."""
     replayed = replay.replay(path, folder, edited)
@@ -248,8 +273,19 @@ def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
     print(f"written to {shown(path.with_suffix('.png'))}")
 
 
-def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None, edited: bool = False) -> None:
-    """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage."""
+def examine(
+    folder: Path,
+    path: Path,
+    common: bool = False,
+    contact: str | None = None,
+    edited: bool = False,
+    hard: bool = True,
+    scene: str | Path = SCENE_FILE,
+) -> None:
+    """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage.
+
+    ``hard``: the hard exam too, of a policy that walks. ``scene``: ``scene_file`` of DeployStage.
+    """
     contract = read_contract(folder, edited)
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
@@ -257,13 +293,20 @@ def examine(folder: Path, path: Path, common: bool = False, contact: str | None 
             raise UserError("--ranges says what the walking exam asks: leave it out")
         if contact:
             raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
+        if isinstance(scene, Path):
+            raise UserError("--scene is of robots that walk, and this exam has grounds of its own: leave it out")
         skill = contract_skill(contract)
         result = run_skill(folder, skill, edited=edited)
         print(skill.table(result))
     else:
-        result = run_exam(folder, common=common, contact=contact, edited=edited)
+        result = run_exam(folder, common=common, contact=contact, edited=edited, scene=scene)
         print(walking.table(result))
+        if hard and contract.feet:
+            rules = walking.ExamRules.from_mapping(result["rules"])
+            result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene)
+            print(f"\n{table(result['hard'])}")
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
+    said |= {"scene": shown(scene)} if isinstance(scene, Path) else {}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}
     try:
         walking.save({**said, **result}, path)

@@ -13,8 +13,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, OWN, Contract, ContractError, Ends, read_contract
+from legged_mw.deploy.contract import CONTRACT_FILE, OWN, SCENE_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.controller import Controller
+from legged_mw.deploy.hard_exam import run_hard, strip_png
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import walking
@@ -25,9 +26,15 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, unknown
 
 
-def run(folder: Path, exam: ExamRules | Skill) -> dict[str, Any]:
-    """Grade the export in ``folder`` by the rules ``exam``."""
-    return run_skill(folder, exam) if isinstance(exam, Skill) else run_exam(folder, exam)
+def run(folder: Path, exam: ExamRules | Skill, hard: bool = True) -> tuple[dict[str, Any], bytes]:
+    """Grade the export in ``folder`` by the rules ``exam``; a walk by the hard exam too, and a PNG of one stride."""
+    if isinstance(exam, Skill):
+        return run_skill(folder, exam), b""
+    result, contract = run_exam(folder, exam), read_contract(folder)
+    if not hard or not contract.feet:
+        return result, b""
+    result["hard"], poses = run_hard(folder, exam, result["walks"])
+    return result, strip_png(folder, contract, poses)
 
 
 def run_exam(
@@ -37,11 +44,12 @@ def run_exam(
     common: bool = False,
     contact: str | None = None,
     edited: bool = False,
+    scene: str | Path = SCENE_FILE,
 ) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by its contract. Raises ContractError, ConfigError.
 
     ``common``: the contract's rules, but with the command range shared by all published policies of the robot.
-    ``contact`` and ``edited``: see DeployStage.
+    ``contact``, ``edited`` and ``scene``, its ``scene_file``: see DeployStage.
     """
     contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
@@ -49,7 +57,9 @@ def run_exam(
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
-    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact, edited=edited)
+    stage = DeployStage(
+        folder, len(wanted), threads=threads, scene_file=scene, ends=ends, contact=contact, edited=edited
+    )
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(walking.EXAM_SECONDS / stage.dt)):

@@ -162,7 +162,7 @@ class _Foot:
         self.radius: Floats = np.where(ball | rod, sizes[:, 0], 0.0)
         self.centre: Floats = boxes[:, :3].copy()
         self.half: Floats = np.where(ball[:, None], 0.0, boxes[:, 3:])
-        self.half[rod] = np.stack([0.0 * sizes[rod, 0], 0.0 * sizes[rod, 0], sizes[rod, 1]], axis=1)
+        self.half[rod] = sizes[rod, 1:2] * [0.0, 0.0, 1.0]
 
     def lowest(self, data: Any, down: Floats) -> Floats:
         """The foot's farthest point (3,) along ``down``."""

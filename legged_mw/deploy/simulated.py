@@ -36,9 +36,11 @@ from legged_mw.deploy.contract import (
     target_range,
 )
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
+from legged_mw.deploy.user_scene import fit
 from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
+from legged_mw.utils.motor_network import DC_DAMPING, DC_STIFFNESS
 
 # ---- a robot placed by its measurements -----------------------------------------------------------------------------
 
@@ -59,8 +61,12 @@ def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity:
     mujoco.mju_mulQuat(data.qpos[3:7], turn, tilt)
     mujoco.mj_kinematics(model, data)
     touching = np.flatnonzero((model.geom_conaffinity > 0) & (model.geom_bodyid > 0)).tolist()
-    lowest = [data.geom_xpos[i, 2] - _reach(model, i, data.geom_xmat[i]) for i in touching]
-    data.qpos[2] -= min(lowest, default=0.0)
+    data.qpos[2] -= min((lowest_point(model, data, geom) for geom in touching), default=0.0)
+
+
+def lowest_point(model: Any, data: Any, geom: int) -> float:
+    """Height [m] of the lowest point of ``geom``: exact for a sphere or capsule, else that of its box."""
+    return float(data.geom_xpos[geom, 2]) - _reach(model, geom, data.geom_xmat[geom])
 
 
 def _reach(model: Any, geom: int, turn: Floats) -> float:
@@ -91,16 +97,19 @@ class Fleet:
         contract: Contract,
         count: int = 1,
         threads: int = 0,
-        scene_file: str = SCENE_FILE,
+        scene_file: str | Path = SCENE_FILE,
         whole: bool = False,
         change: Change | None = None,
+        each: Callable[[], None] | None = None,
     ) -> None:
         """Load the scene and put every robot into its first keyframe.
 
-        ``whole``: the whole body can touch the ground, not only the feet.
-        ``change`` edits the model before the first step. Raises ContractError.
+        ``scene_file``: a file's name in the export, or the path of a scene of the user's; ``contract`` is then what it is
+        in that scene. ``whole``: the whole body can touch the ground, not only the feet.
+        ``change`` edits the model before the first step. ``each`` is called after every physics step; ``read_data``
+        then has the forces of that step. Raises ContractError.
         """
-        scene = read_scene(folder, contract, scene_file, whole)
+        scene, contract = enter_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
         if change:
             change(self.model)
@@ -109,7 +118,8 @@ class Fleet:
         _keep_quiet()
         # the same check as in sim/engines.py
         require_memory(0.2 * mujoco.MjData(self.model).nbuffer * count, "cpu", f"--num_envs {count}", "take fewer")
-        self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
+        self._batch = Batch(self.model, count, threads or min(usable_cores(), count), persistent=each is not None)
+        self._each = each
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
         # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
         self.qpos: Floats = self._batch.bind("qpos")
@@ -119,6 +129,12 @@ class Fleet:
         # (N,) MuJoCo could not step the robot, since its reset
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
+        # (N, D) [rad] or [N m] what the motors get before a robot's first target; newest first, one a period
+        self._start = np.tile(
+            0.0 if contract.action.origin in ("torque", "speed") else contract.default_pose, (count, 1)
+        )
+        self._sent = self._start[None].copy()
+        self._late = np.zeros(count, dtype=int)  # (N,) physics steps from `write` to the motors
         # index of each joint in qpos
         self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]
         self.reset()
@@ -133,14 +149,30 @@ class Fleet:
     def write(self, targets: Floats) -> None:
         """Step every robot by one period with servo targets (N, D) [rad], or torques [N m]."""
         self._ctrl[:, self._actuators] = targets
-        if not self._network:
+        if not self._network and not self._each and not self._late.any():
             self._step(self.contract.decimation, _NOW)
             return
-        for left in reversed(range(self.contract.decimation)):
-            self._ctrl[:, self._actuators] = self._network.torque(
-                targets - self.qpos[:, self._angles], self.qvel[:, self._dofs]
-            )
-            self._step(1, 0 if left else _NOW)
+        self._sent = np.concatenate([targets[None], self._sent[: len(self._sent) - 1]])
+        for step in range(self.contract.decimation):
+            arrived = self._arrived(step)
+            if self._network:
+                arrived = self._network.torque(arrived - self.qpos[:, self._angles], self.qvel[:, self._dofs])
+            self._ctrl[:, self._actuators] = arrived
+            last = step == self.contract.decimation - 1
+            self._step(1, _NOW if last and not self._each else 0)
+            if self._each:
+                self._each()
+        if self._each:
+            self.refresh()
+
+    def _arrived(self, step: int) -> Floats:
+        """What the motors (N, D) have in this physics step of a period."""
+        age = np.maximum(self._late - step + self.contract.decimation - 1, 0) // self.contract.decimation
+        return self._sent[age, np.arange(self.count)]
+
+    def read_data(self, data: mujoco.MjData, world: int = 0) -> None:
+        """Copy one robot's data into ``data``; its forces are those of the last physics step if ``each`` was given."""
+        self._batch.get_data(world, data)
 
     def _step(self, count: int, stage: int) -> None:
         try:
@@ -170,6 +202,7 @@ class Fleet:
         which = np.arange(self.count) if which is None else np.asarray(which)
         self._batch.reset(which, keyframe=0, stage=_NOW)
         self.broken[which] = False
+        self._sent[:, which] = self._start[which]
         if self._network:
             self._network.reset(which)
 
@@ -192,6 +225,44 @@ class Fleet:
                 motors.limp(self._batch)
         off = motors.law == "servo" or not stiffness.any()
         self._batch.expand("dof_damping")[:, dofs] = np.minimum(damping, stable) if off else scene
+
+    def set_delay(self, seconds: Floats) -> None:
+        """Delay what each robot's motors get, (N,) [s]; rounded up to whole physics steps."""
+        self._late = np.ceil(seconds / self.model.opt.timestep - 1e-6).astype(int)
+        periods = 1 + -(-int(self._late.max()) // self.contract.decimation)
+        self._sent = np.repeat(self._start[None], periods, axis=0)
+
+    def scale_gains(self, factor: Floats) -> None:
+        """Multiply each robot's stiffness and damping by its ``factor`` (N,); the torque of motors without gains."""
+        law, shape = self.contract.motors.law, (-1, 1)
+        gains = {"servo": (0,), "dc_motor": (DC_STIFFNESS, DC_DAMPING)}.get(law, ())
+        for column in gains:
+            self._batch.expand("actuator_gainprm")[:, self._actuators, column] *= factor.reshape(shape)
+        if law == "servo":
+            self._batch.expand("actuator_biasprm")[:, self._actuators, 1:3] *= factor.reshape(-1, 1, 1)
+        if law == "servo" and self.damps_by_joint:
+            self._batch.expand("dof_damping")[:, self._dofs] *= factor.reshape(shape)
+        if not gains:
+            self._batch.expand("actuator_gear")[:, self._actuators, 0] *= factor.reshape(shape)
+
+    @property
+    def damps_by_joint(self) -> bool:
+        """Whether the servos' damping is the joints', as in an export's scene; in a user's it is the actuators'."""
+        return self.contract.motors.law == "servo" and not self.model.actuator_biasprm[self._actuators, 2].any()
+
+    def add_load(self, body: int, mass: Floats) -> None:
+        """Add ``mass`` (N,) [kg] to ``body`` of each robot, and inertia in proportion."""
+        ratio = 1.0 + mass / self.model.body_mass[body]
+        self._batch.expand("body_mass")[:, body] *= ratio
+        self._batch.expand("body_inertia")[:, body] *= ratio[:, None]
+        self._batch.set_const()
+
+    def set_friction(self, friction: Floats) -> None:
+        """Set the sliding friction of all contacts of each robot, (N,); NaN: the scene's."""
+        given = np.isfinite(friction)
+        self._batch.expand("geom_friction")[given, :, 0] = friction[given, None]
+        if self.model.npair:
+            self._batch.expand("pair_friction")[given, :, :2] = friction[given, None, None]
 
     def _value(self, name: str) -> Floats:
         if name == "gravity":
@@ -326,6 +397,14 @@ class DeployScene:
     contacts: list[np.ndarray]  # per foot: indices of its contact sensors in sensordata
 
 
+def enter_scene(folder: Path, contract: Contract, file: str | Path, whole: bool) -> tuple[DeployScene, Contract]:
+    """The scene, and the contract in it. Raises ContractError, and UserError for a user's scene that does not fit."""
+    if isinstance(file, str):
+        return read_scene(folder, contract, file, whole), contract
+    spec, contract = fit(file, folder, contract, lowest_point)
+    return _find_all(spec, spec.compile(), file.name, contract), contract
+
+
 def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> DeployScene:
     """Load ``file`` of an export and check that it is the contract's robot. Raises ContractError.
 
@@ -351,6 +430,15 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
             model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
+    scene = _find_all(spec, model, file, contract)
+    _check_order(model, contract)
+    joints = [model.joint(name).id for name in contract.joints]
+    _check_machine(model, file, contract, joints, scene.actuators.tolist())
+    return scene
+
+
+def _find_all(spec: mujoco.MjSpec, model: mujoco.MjModel, file: str, contract: Contract) -> DeployScene:
+    """Joints, servos and sensors by name."""
     joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]
     actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
     needed = [*SENSED, *([FALL] if contract.ends.falls_on else [])]
@@ -368,8 +456,6 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
                 f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}"
             )
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
-    _check_order(model, contract)
-    _check_machine(model, file, contract, joints, actuators)
     return DeployScene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
 
 

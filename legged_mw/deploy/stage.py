@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.odometry import Odometry
-from legged_mw.deploy.robot import Floats
+from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Change, Fleet
 
 STROLL = {"lin_vel_x": 0.5}  # [m/s] without a command: a walking robot shows more than a standing one
@@ -33,22 +33,25 @@ class DeployStage:
         num_worlds: int = 1,
         command: Sequence[float] | None = None,
         threads: int = 0,
-        scene_file: str = SCENE_FILE,
+        scene_file: str | Path = SCENE_FILE,
         ends: Ends | None = None,
         contact: str | None = None,
         change: Change | None = None,
         whole: bool = False,
         edited: bool = False,
+        each: Callable[[], None] | None = None,
     ) -> None:
         """Load the export in ``folder``.
 
-        ``command`` (C,) applies when ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
-        ``change`` edits the model before the first step. ``whole``: see Fleet. ``edited``: see read_contract.
+        ``scene_file``: see Fleet. ``command`` (C,) applies when ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
+        ``change``, ``whole`` and ``each``: see Fleet. ``edited``: see read_contract.
         ``contact``: the policy sees the velocity of leg odometry with this contact detection; None: the true velocity.
         """
         contract = read_contract(folder, edited)
-        self.contract = replace(contract, ends=ends or contract.ends)
-        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, whole, change)
+        self.fleet = Fleet(
+            folder, replace(contract, ends=ends or contract.ends), num_worlds, threads, scene_file, whole, change, each
+        )
+        self.contract = self.fleet.contract
         self.controller = Controller(folder, self.contract, num_worlds)
         self.odometry = Odometry(folder, self.contract, num_worlds, contact) if contact else None
         self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period
@@ -57,6 +60,7 @@ class DeployStage:
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()
         self._fell = np.zeros(num_worlds, dtype=bool)
+        self.disturb: Callable[[Measurement], Measurement] | None = None  # what the policy measures -> what it sees
         self.measured = self._seen = self.fleet.read()  # after the last step; as the policy saw it
 
     def step(self, commands: Floats | None = None) -> None:
@@ -65,6 +69,8 @@ class DeployStage:
             self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
         )
         self._seen = self.odometry(self.measured) if self.odometry else self.measured
+        if self.disturb:
+            self._seen = self.disturb(self._seen)
         self.fleet.write(self.controller.act(self._seen, self._commands))
         self._fell = self.fleet.fell()
         if self._fell.any():

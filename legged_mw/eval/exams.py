@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.eval import perform, report, rollout, rough, walking
+from legged_mw.eval import hard, perform, report, rollout, rough, walking
 from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Policy, TrainingExam
 from legged_mw.eval.skills import SKILLS, Skill
@@ -130,13 +130,13 @@ class Graded(NamedTuple):
     crossing: LoadedTask | None  # the rough part of the exam, if there is one
 
 
-Elsewhere = Callable[[Graded], list[tuple[str, dict[str, Any]]]]  # results by name
+Elsewhere = Callable[[Graded], list[Column]]
 
 
 def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
     """Grade policies, each with its trained config. Print their tables and write a report next to the first.
 
-    ``elsewhere`` grades the first policy again on another physics engine.
+    ``elsewhere`` grades the first policy again on another physics engine, by the hard exam too.
     """
     device = pick_device(args.device)
     first, *rivals = policies
@@ -147,7 +147,10 @@ def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namesp
     writable(str(folder), "the report goes to", folder=True)
     built = [(each, *build(each, args, device)) for each in graded]  # an error must come before a long exam
     columns = [make_column(*each) for each in built]
-    columns[1:1] = [Column(name, {}, result) for name, result in elsewhere(graded[0])]
+    columns[1:1] = elsewhere(graded[0])
+    for column in columns[1:]:
+        if "hard" in column.exam:
+            print(f"{column.name}\n{hard.table(column.exam['hard'])}\n")
     graded[0].exam.write(folder, graded[0].task.name, columns)
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 

@@ -185,7 +185,7 @@ def of_result(result: Mapping[str, Any]) -> Skill:
 def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     """Write ``report.json`` and ``report.html``; see ``report.write``."""
     folder.mkdir(parents=True, exist_ok=True)
-    content = {"task": task, "columns": [{**column._asdict(), "figures": None} for column in columns]}
+    content = {"task": task, "columns": [{**column.plain(), "figures": None} for column in columns]}
     (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     strips = (columns[0].figures or {}).get("strips", {})
     for name, picture in strips.items():

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from legged_mw.eval import hard
 from legged_mw.eval.walking import AXES, LEVELS, PUSH_DIRECTIONS, ExamRules, Figure, best_of, verdicts
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 TEXTS = {
+    "hard": "{count} commands of 6 s and {pushes} pushes from all sides under each condition alone, then all of them: 10 ms, gains x 0.9, "
+    "load, friction 0.5, noise. Below: how it looks while it walks at {vx:g} m/s, with the marks of ready for a robot.",
     "crossing": "Commanded ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
     "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
     "ground; below it stands what makes it hard, level by level. Dark is good.",
@@ -57,6 +60,11 @@ class Column(NamedTuple):
     about: dict[str, Any]  # policy, engine, device, overrides; a warning if contact buffers overflowed
     exam: dict[str, Any]  # the result of ``ExamRules.grade``
     figures: dict[str, Any] | None = None  # None: exam result only, such as on another physics engine
+    strip: bytes = b""  # a PNG of one stride; empty: none
+
+    def plain(self) -> dict[str, Any]:
+        """All but the picture, for JSON."""
+        return {name: value for name, value in self._asdict().items() if name != "strip"}
 
 
 def walking_page(
@@ -80,7 +88,8 @@ def walking_page(
     header = f"""{_names(columns, rules)}{_cards(figures[0])}</header>
 <section><h2>Exam</h2><p class="lead">{note}</p>{exam_table(columns, figures, rules.peer_label)}</section>"""
     published = _published(rules, columns) if len(rules.peers) > 1 else ""
-    return _page(task, "walking exam", "Walking exam", f"{header}\n{''.join(chapters)}{published}", columns)
+    harder = "".join(_hard(column) for column in columns if "hard" in column.exam)
+    return _page(task, "walking exam", "Walking exam", f"{header}\n{harder}{''.join(chapters)}{published}", columns)
 
 
 def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]) -> str:
@@ -93,6 +102,24 @@ def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]
 <footer>{about(columns)}</footer>
 </main></body></html>
 """
+
+
+def _hard(column: Column) -> str:
+    """The chapter of the hard exam: conditions, how it looks, a stride in pictures."""
+    result = column.exam["hard"]
+    heads = ["", "falls", "error vx, vy, yaw rate", "drift [m]", f"pushes of {result['push_speed']:g} m/s survived"]
+    rows = []
+    for name, each in result["conditions"].items():
+        error = ", ".join(f"{value:.3f}" for value in each["error"])
+        drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
+        title = f"load of {result['load']:g} kg" if name == "load" else name
+        rows.append([title, str(each["falls"]), error, drift, f"{each['pushes']:.0%}"])
+    looked = exam_table([column], [hard.figures(result)], "", "ready at") if result["looks"] else ""
+    missed = f"<p>Not ready: {escape('; '.join(result['misses']))}.</p>" if result["misses"] else ""
+    lead = TEXTS["hard"].format(count=len(result["commands"]), pushes=hard.PUSH_DIRECTIONS, vx=result["vx"])
+    strip = picture(column.strip, "one stride, from the side and from the front") if column.strip else ""
+    said = f'<p class="lead">{lead}</p>{pill("ready for a robot", "not ready for a robot", result["ready"])}{missed}'
+    return f"<section><h2>Hard exam</h2>{said}{table(heads, rows)}{looked}{strip}</section>"
 
 
 def _names(columns: Sequence[Column], rules: ExamRules) -> str:
@@ -325,7 +352,10 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     asked = ExamRules.from_mapping(columns[0].exam["rules"])
-    content = {"task": task, "columns": [column._asdict() for column in columns]}
+    content = {"task": task, "columns": [column.plain() for column in columns]}
+    for column in columns:
+        if column.strip:
+            (folder / "stride.png").write_bytes(column.strip)
     if asked.peers:
         content |= {"peer": best_of(asked.peers), "peers": [peer._asdict() for peer in asked.peers]}
     _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")

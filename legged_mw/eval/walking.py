@@ -59,13 +59,14 @@ class Peer(NamedTuple):
         return all(getattr(rules, name) == value for name, value in self.asked.items() if name not in apart)
 
 
-def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges]]:
-    """By robot, from ``resources/peers.yaml``: its published policies, and their common command range.
+def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, float]]:
+    """By robot, from ``resources/peers.yaml``: its published policies, their common command range, their load [kg].
 
     A policy that was measured in its trained ranges and in the common range is listed twice.
     """
     peers: dict[str, list[Peer]] = {}
     common: dict[str, Ranges] = {}
+    loads: dict[str, float] = {}
     # the project's own file: libyaml reads it in a ninth of the time of load_yaml, at each start of a training
     text = (ROOT / "resources/peers.yaml").read_text(encoding="utf-8")
     for robot, said in yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
@@ -73,6 +74,8 @@ def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges]]:
         peers[robot] = []
         if "common" in said:
             common[robot] = tuple((low, high) for low, high in said["common"])
+        if "load" in said:
+            loads[robot] = float(said["load"])
         for each in said["policies"]:
             half = round(each["trained"][0] / 2, 4)
             asked = {"push_speeds": speeds, **{name: each.get(name, half) for name in ("push_vx", "transport_vx")}}
@@ -83,10 +86,10 @@ def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges]]:
             if "common" in each:
                 alike = {"ranges": common[robot], **asked}
                 peers[robot].append(Peer(each["name"], alike, {"falls": 0, **each["common"], **rest}, own_speed=True))
-    return peers, common
+    return peers, common, loads
 
 
-PEERS, COMMON = _read_peers()
+PEERS, COMMON, LOADS = _read_peers()
 ALIASES = {"playground_go1": "go1"}  # older runs and exports name a policy
 
 

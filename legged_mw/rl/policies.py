@@ -1,8 +1,11 @@
-"""Trained policies on disk: finding one, and loading its actor from a checkpoint or an exported network."""
+"""Trained policies on disk: finding one, loading its actor from a checkpoint or an exported network, learning from it."""
 
 from __future__ import annotations
 
 import copy
+import shutil
+from collections.abc import Iterable, Sequence
+from inspect import getfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,20 +17,25 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw import ROOT
+from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.checkpoint import check_fit, load_tensors
-from legged_mw.rl.learner_config import actor_settings, check_classes, check_room, network_section
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.rl.learner_config import RobotTaskCfgPPO, actor_settings, check_classes, check_room, network_section
 from legged_mw.rl.run_folder import (
     CONFIG_FILE,
+    check_fit,
+    checkpoints,
     experiment_folder,
     find_checkpoint,
     find_run,
+    load_tensors,
     runs,
     task_of,
     update_from_run,
 )
-from legged_mw.utils.config import Config, ConfigError, load_yaml
-from legged_mw.utils.errors import printable, shown
+from legged_mw.utils.commands import command_table
+from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
+from legged_mw.utils.errors import printable, shown, unknown
 from legged_mw.utils.files import check_folder, finish_moving, typed
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
@@ -234,3 +242,213 @@ def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
         if node.op_type == "Div" and node.input[0] in centred and node.input[1] in stored:
             return stored[node.input[1]]
     raise ConfigError(f"{path} is no network that this project exported: it does not begin with (obs - mean) / std")
+
+
+# ---- learning from a policy of another run: as a student of a teacher, or as a warm start ---------------------------
+
+
+TEACHER = "teacher"  # the observation group of a teacher, and its folder in a student's run
+# count of samples of an exported normaliser, which the file does not hold [ours: as most have seen]
+_EXPORTED_COUNT = 10**8
+
+# Fields that must be equal, or an action or a row would mean something else. Not every task has them.
+_SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "gait.offsets")
+_SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
+
+
+def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
+    """Change rsl-rl's ``settings`` for a warm start, or for a student whose ``teacher`` is this network."""
+    distillation, start = cfg.to_dict()["distillation"], cfg.warm_start
+    settings["critic_warmup"] = start.critic_warmup if start.policy and not teacher else 0
+    noise = settings["actor"].get("distribution_cfg", {})
+    if "init_std" in noise and (teacher or start.policy):
+        noise["init_std"] = distillation["init_std"] if teacher else start.init_std
+    if teacher:
+        groups = {"student": settings["obs_groups"]["actor"], "teacher": [TEACHER]}
+        algorithm = {name: value for name, value in distillation.items() if name not in ("teacher", "init_std")}
+        settings |= {
+            "student": settings["actor"],
+            "teacher": teacher,
+            "obs_groups": groups,
+            "algorithm": algorithm,
+            "anneal": {},
+        }
+    return settings
+
+
+def attach_teacher_observations(env: RobotTask, teacher: Trained) -> None:
+    """Add the teacher's observation group to ``env``. Raises ConfigError if its actions mean something else here."""
+    env.observations.attach(_observe(env, teacher, "the teacher"), TEACHER, TEACHER)
+    env.first_observations()
+
+
+def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
+    """Load the teacher's parameters into ``model``. Raises ConfigError if ``env`` gives another number of inputs."""
+    path = teacher.source.checkpoint
+    try:
+        model.load_state_dict(read_actor(path, model, TEACHER))
+    except ConfigError as error:
+        rows = env.observations.groups[TEACHER]
+        raise ConfigError(f"{error}; it is shown {sum(row.size for row in rows)} values: {_in_words(rows)}") from None
+
+
+def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
+    """Raise ConfigError if ``policy`` reads other rows than the actor of ``task``, or acts by another convention."""
+    theirs = _observe(env, policy, "the policy to begin with").rows(TEACHER)
+    ours = [row for group in task.train.obs_groups.actor for row in env.observations.rows(group)]
+    if [*map(_layout, theirs)] != [*map(_layout, ours)]:
+        raise ConfigError(
+            f"{shown(policy.source.checkpoint)}: it reads {_in_words(theirs)}; "
+            f"the actor of {task.name} reads {_in_words(ours)}"
+        )
+
+
+def begin_with(model: MLPModel, policy: Trained) -> None:
+    """Load the actor's parameters into ``model``, which keeps its own noise."""
+    path, own = policy.source.checkpoint, model.state_dict()
+    if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
+        raise ConfigError(
+            f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; "
+            "name a checkpoint"
+        )
+    saved = read_actor(path, model)
+    # the normalisers of observations and of targets
+    for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:
+        of = name.removesuffix("_std")
+        saved |= {f"{of}_var": saved[name].square(), f"{of}count": torch.full_like(own[f"{of}count"], _EXPORTED_COUNT)}
+    model.load_state_dict({**saved, **{name: value for name, value in own.items() if name.startswith("distribution.")}})
+
+
+def keep_teacher(teacher: Trained, run: Path) -> None:
+    """Copy the teacher into the student's run folder: a resume needs it even if the teacher's run is gone."""
+    folder = run / TEACHER
+    if not folder.exists():
+        folder.mkdir()
+        save_yaml(folder / CONFIG_FILE, teacher.task.to_dict())
+        file = teacher.source.checkpoint  # of any name; a resumed run looks for one of these
+        known = file.name if file in checkpoints(file.parent).values() else "model_0.pt"
+        shutil.copy(file, folder / (NETWORK_FILE if file.suffix == ".onnx" else known))
+
+
+def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
+    """The policy's observations in ``env``, as the group TEACHER. Raises ConfigError if a meaning differs."""
+    task, kind = policy.task, _class_in(env, policy.task.env_class)
+    found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
+    if kind:
+        try:
+            seen = _observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
+            if not (found := _differences(env, task.cfg, seen.rows(TEACHER))):
+                return seen
+        except ConfigError as error:  # a row that needs a sensor which is missing here
+            found = [str(error)]
+    raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
+
+
+def _layout(row: Row) -> tuple[str, int, int, list[float]]:
+    return row.name, row.value.shape[1], row.history, row.column_scales()
+
+
+# ---- a policy of another task in this one: what it reads here, and why its actions may mean something else ----------
+
+
+def _class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
+    """``kind`` among the classes of ``env``, by name and file: a task's file may have been imported twice."""
+    return next(
+        (
+            each
+            for each in type(env).__mro__
+            if each.__qualname__ == kind.__qualname__ and getfile(each) == getfile(kind)
+        ),
+        None,
+    )
+
+
+def _observe_as(
+    env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str
+) -> Observations:
+    """Observations of ``env`` as those of a ``kind`` with the config ``cfg``; the group ``name`` joins ``groups``.
+
+    They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for
+    a group that the table does not have.
+    """
+    table = kind.observation_rows(_as_on_a_plane(env, cfg))  # the rows go by the section noise and others
+    for group in groups:
+        if group not in table:
+            raise ConfigError(unknown("observation group", group, table, kind.__name__))
+    exact = {
+        group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows]
+        for group, rows in table.items()
+    }
+    return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device)
+
+
+def _in_words(rows: Iterable[Row]) -> str:
+    """``base_ang_vel 3, dof_pos 12 x 5 frames``"""
+    return ", ".join(
+        f"{row.name} {row.value.shape[1]}" + (f" x {row.history} frames" if row.history > 1 else "") for row in rows
+    )
+
+
+def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
+    """Each difference, in words, by which a policy of ``cfg`` with these ``rows`` means something else in ``env``."""
+    kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
+    found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
+    there, here = (
+        ", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table)
+    )
+    found.append(_differ("the list of commands", there, here))
+    if any(found):
+        return [text for text in found if text]
+    theirs, ours = _as_on_a_plane(env, cfg)._load_robot("mujoco"), env.robot
+    if theirs.joint_names != ours.joint_names:
+        return [
+            f"its robot is another one, with the joints {_few(theirs.joint_names)}; "
+            f"here they are {_few(ours.joint_names)}"
+        ]
+    found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
+    there, here = (robot.tables["control.action_scale"] for robot in (theirs, ours))
+    found.append(_joint("control.action_scale", ours.joint_names, there, here, ""))
+    there, here = (f"{1.0 / (each.sim.dt * each.control.decimation):g} Hz" for each in (cfg, env.cfg))
+    found.append(_differ("the control rate", there, here))
+    found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
+    scan = [row for row in rows if row.name == "height_scan"]
+    if scan and not scan[0].value.shape[1]:
+        found.append(
+            "it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state"
+        )
+    found += [
+        _differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))
+    ]
+    return [text for text in found if text]
+
+
+def _as_on_a_plane(env: RobotTask, cfg: RobotTaskCfg) -> RobotTask:
+    """A shallow copy of ``env`` with another config, to read only: it shares the tensors."""
+    other = copy.copy(env)
+    other.cfg, other.terrain = cfg, None
+    return other
+
+
+def _field(cfg: RobotTaskCfg, path: str) -> Any:
+    """A field by its path; None if the task has no such field."""
+    value: Any = cfg
+    for name in path.split("."):
+        value = getattr(value, name, None)
+    return value
+
+
+def _differ(what: str, there: Any, here: Any) -> str:
+    return "" if there == here else f"{what} is {there} there and {here} here"
+
+
+def _joint(what: str, names: Sequence[str], there: Sequence[float], here: Sequence[float], unit: str) -> str:
+    """The first joint that differs."""
+    for name, theirs, ours in zip(names, there, here, strict=True):
+        if abs(theirs - ours) > 1e-6:
+            return f"{what} of joint {name} is {theirs:g}{unit} there and {ours:g}{unit} here"
+    return ""
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first three names and how many there are."""
+    return f"{', '.join(names[:3])} ... ({len(names)})" if len(names) > 3 else ", ".join(names)

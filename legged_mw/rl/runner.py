@@ -31,7 +31,6 @@ from legged_mw.envs.snapshot import (
     take_snapshot,
 )
 from legged_mw.envs.statistics import DivergenceStop
-from legged_mw.rl.checkpoint import check_fit, check_resume, load_tensors, save_whole, unpack
 from legged_mw.rl.iteration_log import (
     Clock,
     Console,
@@ -45,11 +44,19 @@ from legged_mw.rl.iteration_log import (
 )
 from legged_mw.rl.learner_config import RobotTaskCfgPPO, rsl_rl_config
 from legged_mw.rl.networks import RegressingModel
-from legged_mw.rl.policies import acting
+from legged_mw.rl.policies import TEACHER, acting, adapt
 from legged_mw.rl.ppo import GraphedPPO, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
-from legged_mw.rl.run_folder import CheckpointWriter, reason_of, worlds_file
-from legged_mw.rl.transfer import TEACHER, adapt
+from legged_mw.rl.run_folder import (
+    CheckpointWriter,
+    check_fit,
+    check_resume,
+    load_tensors,
+    reason_of,
+    save_whole,
+    unpack,
+    worlds_file,
+)
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 

@@ -22,7 +22,16 @@ from rsl_rl.algorithms import Distillation
 from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.learner_config import MAX_RATE, check_classes, check_room, fit_cpu
-from legged_mw.rl.policies import Trained, find_trained
+from legged_mw.rl.policies import (
+    TEACHER,
+    Trained,
+    attach_teacher_observations,
+    begin_with,
+    check_start,
+    find_trained,
+    keep_teacher,
+    load_teacher,
+)
 from legged_mw.rl.ppo import Recorded
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
 from legged_mw.rl.run_folder import (
@@ -38,14 +47,6 @@ from legged_mw.rl.run_folder import (
     update_from_run,
 )
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.transfer import (
-    TEACHER,
-    attach_teacher_observations,
-    begin_with,
-    check_start,
-    keep_teacher,
-    load_teacher,
-)
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_everything

@@ -27,6 +27,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--picture", metavar="PNG", help="draw it from two sides: feet, IMU, colliders, joint axes")
     parser.add_argument("--new", metavar="NAME", help="write NAME.xml and NAME_flat.py, a first task for the robot")
     parser.add_argument("--out", metavar="DIR", default=".", help="where --new writes (default: here)")
+    parser.add_argument(
+        "--sim", action="store_true", help="--new writes a task for simulation alone: a told velocity, alike worlds"
+    )
     parser.add_argument("--force", action="store_true", help="--new may overwrite")
     args = parser.parse_args()
     if args.picture is not None:
@@ -46,7 +49,7 @@ def main() -> None:
     if args.new:
         # refuse before the page, not after it
         new.targets(args.new, writable(args.out, "--out", folder=True), args.force)
-    found = draft(file)
+    found = draft(file, args.sim)
     env = as_env(found, file)
     show(env, file.name, image, found)
     if args.new:

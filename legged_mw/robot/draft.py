@@ -26,8 +26,10 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.robot.makers import Maker, find_maker
 from legged_mw.robot.measure import (
+    GRAVITY,
     Gains,
     Joint,
+    beyond_euler,
     mass_matrices,
     stand_as_statue,
     stand_on_servos,
@@ -46,6 +48,12 @@ from legged_mw.utils.task import import_task
 LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
 # factors on the suggested gains; published gains are at most twice the suggested ones [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
+# of the solver under implicitfast [ours: with 1 and 5 no robot stands, with 3 and 5 one of four falls]
+IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
+# reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
+# soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
+LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.5}
+LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "pose": 1.0, "action_rate": -0.02, "feet_orientation": -1.0}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
@@ -62,7 +70,9 @@ class Draft(NamedTuple):
     pose_from: str  # source of the default pose, as text
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
     maker: Maker | None  # what its maker publishes, if that is known
+    gains_from: str  # source of the gains, as text
     judged: list[Judged]  # the poses that were judged, the chosen one first
+    simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
     angles: dict[str, float]  # joint -> default angle [rad], those that are held too
 
     @property
@@ -71,7 +81,7 @@ class Draft(NamedTuple):
         return [name for name in self.angles if name not in self.robot.joint_names]
 
 
-def draft(file: Path) -> Draft:
+def draft(file: Path, simple: bool = False) -> Draft:
     """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF)."""
     read = read_robot(file)
     from_file = read.keyframe is not None
@@ -100,39 +110,72 @@ def draft(file: Path) -> Draft:
         raise ModelError(
             f"'{robot.root}', the root, is not above the lowest ends of limbs, {ends}; the health page is of robots that stand on them"
         )
-    firmness, gains = _firm(robot, pose, place, joints, feet)
+    gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [
         f"pose: {how}{', though: ' * bool(judged[0].faults)}{'; '.join(judged[0].faults)}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
-        "gains: as suggested below"
-        if firmness == 1.0
-        else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
+        f"gains: {gains_from}",
     ]
     if held:
         guessed.append(f"held: {', '.join(patterns(held, robot.joint_names))}: {len(held)} joints that do not walk")
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more], maker, judged, angles)
+    notes = [*read.notes, *more]
+    return Draft(
+        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles
+    )
 
 
-def _firm(
-    robot: RobotModel, pose: list[float], place: list[float], joints: Sequence[Joint], feet: Sequence[Foot]
-) -> tuple[float, list[Gains]]:
-    """The smallest of FIRMNESS at which the robot stands on its feet, and its gains.
+def _servos(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    maker: Maker | None,
+) -> tuple[list[Gains], str]:
+    """Gains of each joint, and where they come from: the maker's, else as suggested, else firmer.
 
-    1 if the robot stands at none of them, or has two feet: a biped falls over at any gains.
+    On more than two feet they are the smallest of FIRMNESS on which the robot stands. A biped falls on any.
     """
+    names = robot.joint_names
+    kp, kd = (maker.of(table, names) if maker else {} for table in ("kp", "kd"))
+    known = {name: Gains(kp[name], kd[name]) for name in names if name in kp and name in kd}
+    moment = GRAVITY * float(robot.physics.body_subtreemass[0]) * place[2]
+
+    def chosen(firmness: float) -> list[Gains]:
+        suggested = zip(names, suggest(joints, moment, firmness), strict=True)
+        return [known.get(name, gains) for name, gains in suggested]
+
+    if maker and len(known) == len(names):
+        return chosen(1.0), f"its maker's, {maker.source}"
+    some = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
+    for firmness in FIRMNESS if len(feet) > 2 else ():
+        if _stands(robot, pose, place, joints, feet, chosen(firmness)):
+            firmer = f"{firmness:g} times what is suggested below, to stand on its servos"
+            return chosen(firmness), ("as suggested below" if firmness == 1.0 else firmer) + some
+    return chosen(1.0), "as suggested below" + some
+
+
+def _stands(
+    robot: RobotModel,
+    pose: list[float],
+    place: list[float],
+    joints: Sequence[Joint],
+    feet: Sequence[Foot],
+    gains: Sequence[Gains],
+) -> bool:
+    """Whether the robot stands on its feet with these ``gains``."""
     model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
     for geom in range(robot.ground_geoms().stop, model.ngeom):
         model.geom_conaffinity[geom] *= model.geom(geom).name in touching
-    for firmness in FIRMNESS if len(feet) > 2 else ():
-        gains = suggest(joints, float(model.opt.timestep), firmness)
-        model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
-        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
-        firm = replace(robot, physics=model)
-        if stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
-            return firmness, gains
-    return 1.0, suggest(joints, float(model.opt.timestep))
+    model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
+    model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+    if beyond_euler(joints, gains, float(model.opt.timestep)):
+        model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations = IMPLICIT["iterations"], IMPLICIT["ls_iterations"]
+    firm = replace(robot, physics=model)
+    return stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands"
 
 
 def _bare(file: Path, keyframe: bool, held: Sequence[str] = (), angles: Mapping[str, float] | None = None) -> RobotTask:
@@ -154,17 +197,19 @@ def _bare(file: Path, keyframe: bool, held: Sequence[str] = (), angles: Mapping[
 def as_env(found: Draft, file: Path) -> LeggedRobot:
     """One world of the draft's task."""
     cfg = parents(found)[0]()
-    cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
-    cfg.asset.file = str(file.resolve())
+    cfg.update({"env": {"num_envs": 1}, **values(found)}, where="the health page")
+    cfg.asset.file, cfg.sim.engine = str(file.resolve()), "mujoco"
     return LeggedRobot(cfg, "cpu")
 
 
 def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]]:
     """The base classes of the task's configs."""
+    if len(found.feet) != 2 and found.simple:
+        return LeggedRobotCfg, LeggedRobotCfgPPO
+    presets = import_task(ROOT / "configs/base.py")
     if len(found.feet) == 2:
-        presets = import_task(ROOT / "configs/base.py")
         return presets.BipedCfg, presets.BipedCfgPPO
-    return LeggedRobotCfg, LeggedRobotCfgPPO
+    return presets.SimToRealCfg, presets.SimToRealCfgPPO
 
 
 def has_mirror(env: LeggedRobot) -> bool:
@@ -184,9 +229,10 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if said := {
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
-        asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
+        asset["joint_speed_limits"] = short_table(said, names)
     if found.held:
         asset["held_joints"] = patterns(found.held, names)
+    asset |= _motors(found)
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
@@ -194,33 +240,68 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),
-            "action_scale": 0.5,
+            "action_scale": _action_scale(found),
         },
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
     }
+    if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
+        chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
+    if chosen["control"]["action_scale"] < 0.5:
+        chosen["normalization"] = {"clip_actions": 4.0}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
-    return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+    if found.simple:
+        return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+    weights = table(pose_weights(found.robot, found.pose, found.feet), names)
+    rewards = {**low, "pose_weights": weights, "scales": dict(LOOKS)}
+    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "rewards": rewards}
+
+
+def _action_scale(found: Draft) -> float:
+    """How far an action of 1 moves a joint [rad]: less where 0.5 rad ask for more than 0.7 of most motors' effort."""
+    asked = sorted(gain.kp / joint.effort for gain, joint in zip(found.gains, found.joints, strict=True))
+    return 0.5 if 0.5 * asked[len(asked) // 2] <= 0.7 else 0.25
+
+
+def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
+    """Randomized worlds: what differs with the robot's size, and delays. ``shares`` of the mass, on the root."""
+    mass = float(found.robot.physics.body_subtreemass[0])
+    return {"base_mass": [round(share * mass, 2) for share in shares], "delay_ms": [0.0, 15.0]}
+
+
+def _motors(found: Draft) -> dict[str, dict[str, float]]:
+    """What a maker publishes of motors where the robot's file says nothing: armature [kg m^2], effort [N m]."""
+    if not found.maker:
+        return {}
+    bare = [joint.name for joint in found.joints if not joint.armature]
+    endless = [joint.name for joint in found.joints if not math.isfinite(joint.effort)]
+    said = {"armature": found.maker.of("armature", bare), "effort": found.maker.of("effort", endless)}
+    return {name: short_table(known, found.robot.joint_names) for name, known in said.items() if known}
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Further values for a biped: they replace BipedCfg's numbers of a G1, and simplify training on a few cores."""
-    robot, mass = found.robot, float(found.robot.physics.body_subtreemass[0])
+    """Further values for a biped: they replace BipedCfg's numbers of a G1; a simple task leaves out what is hard."""
+    robot = found.robot
     data = posed(robot.physics, found.pose)
     left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
+    rewards: dict[str, Any] = {
+        **low,
+        "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
+        "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
+        "scales": {"contact_phase": 1.0, "no_fly": 0.5, **({} if found.simple else LOOKS_OF_A_BIPED)},
+    }
+    worlds = _worlds(found, (-0.03, 0.06))
+    if not found.simple:
+        ranges = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1.0, 1.0]}
+        return {"commands": {"ranges": ranges}, "domain_rand": worlds, "rewards": rewards}
     return {
         "commands": {"ranges": {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}},
         "observations": {"leave_out": {}},
-        "domain_rand": {"enable": False, "base_mass": [round(share * mass, 2) for share in (-0.03, 0.06)]},
+        "domain_rand": {"enable": False, "base_mass": worlds["base_mass"]},
         "perturbation": {"push": False, "velocity": [0.0, 4.0]},
-        "rewards": {
-            **low,
-            "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
-            "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
-            "scales": {"contact_phase": 1.0, "no_fly": 0.5},
-        },
+        "rewards": rewards,
     }
 
 
@@ -246,6 +327,11 @@ def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
         if number != common:
             short[key] = number
     return short if _reads(short, names, numbers) else exact
+
+
+def short_table(said: dict[str, float], names: Sequence[str]) -> dict[str, float]:
+    """``table`` of numbers that are known for all ``names``; else ``said`` itself."""
+    return table([said[name] for name in names], names) if len(said) == len(names) else said
 
 
 def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[float]) -> bool:
@@ -298,6 +384,17 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     return [_foot(robot, body, soles[body]) for body in sorted(soles)]
 
 
+def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
+    """Raise ModelError if the file's mesh of a low end of a limb cannot be read: it may be a foot."""
+    model, data = robot.physics, posed(robot.physics, qpos[7:], qpos[:7])
+    low = min(float(data.geom_xpos[robot.id("geom", geom), 2]) for foot in feet for geom in foot.geoms)
+    for body in {*range(1, model.nbody)} - {*model.body_parentid}:
+        name = model.body(body).name
+        is_low = data.xpos[body, 2] < 0.5 * (low + float(qpos[2]))
+        if name in robot.names.lost and not robot.names.bodies[name] and is_low:
+            raise ModelError(robot.names.lost[name])
+
+
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
     """The sole of a body: its lowest geom, and geoms of that type at about that height.
 
@@ -317,18 +414,26 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
 
 
-# ---- a biped's weights of the pose reward
+# ---- weights of the pose reward
 
-WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # from configs/g1_flat.py
+# from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
+WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
+KNEE_WALKS = 0.1  # on more feet, where all other joints have 1 [MuJoCo Playground]
 
 
 def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
-    """Weights (D,) of a biped's pose reward: smallest for hip and knee, small for the ankle, large for all others."""
+    """Weights (D,) of the pose reward: smallest for what walks (hip and knee; on more than two feet the knee alone)."""
     model, data = robot.physics, posed(robot.physics, pose)
-    weights = [HELD] * len(robot.joint_names)
+    weights = [QUIET if len(feet) == 2 else 1.0] * len(robot.joint_names)
     for foot in feet:
         legs = joints_to(model, foot)
         sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
+        if len(feet) != 2:
+            for joint in sideways[1:2]:
+                weights[joint - 1] = KNEE_WALKS
+            continue
+        for joint in legs:
+            weights[joint - 1] = HELD
         for joint in sideways[:2]:
             weights[joint - 1] = WALKS
         for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():

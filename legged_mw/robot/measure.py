@@ -34,6 +34,7 @@ STAND_SECONDS = 5.0  # [s] duration of the standing test
 STAND_TILT = 60.0  # [deg] of the root; a larger tilt is a fall
 STAND_HEIGHT = 0.5  # share of the initial height; below it, the robot sank
 TOPPLED = 15.0  # [deg] beyond this tilt the rigid robot does not rest on its feet
+GRAVITY = 9.81  # [m/s^2]
 _STIFF = 1e5  # [kg m^2] armature that locks a joint: 100 N m accelerate it by 1 mrad/s^2
 _FAST = 1.0e4  # [m/s, rad/s] a faster state counts as diverged (termination.max_speed)
 
@@ -120,6 +121,11 @@ class RobotNumbers:
     dt: float  # [s] substep
     implicit: bool  # whether the integrator is implicitfast
     room: Capacity  # for contacts and constraint rows in mujoco-warp
+
+    @property
+    def moment(self) -> float:
+        """Weight times the height of the root [N m], of ``suggest``."""
+        return GRAVITY * self.mass * self.height
 
 
 def measure(
@@ -301,11 +307,11 @@ def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float],
 
 # ---- initial gains: our rules ----
 
-FULL_EFFORT_AT = 1.0  # [rad]
+UPRIGHT = 0.4  # share of the robot's weight times its height that a servo is to bear at 1 rad
 LOAD, SAG = 2.0, 0.4  # multiple of the torque at rest, and position error [rad] at that torque
 SWING = 2.0  # [Hz]
 DAMPING_TIME = 0.025  # [s] kd / kp
-MOST = 0.5  # upper bound of dt sqrt(kp / I) and of dt kd / I
+MOST = 0.5  # of dt sqrt(kp / I) and of dt kd / I, in explicit Euler
 
 
 class Gains(NamedTuple):
@@ -313,37 +319,36 @@ class Gains(NamedTuple):
 
     kp: float  # [N m/rad]
     kd: float  # [N m s/rad]
-    cut: bool  # whether the time step limits one of them
 
 
-def suggest(joints: Sequence[Joint], dt: float, firmness: float = 1.0) -> list[Gains]:
+def suggest(joints: Sequence[Joint], moment: float, firmness: float = 1.0) -> list[Gains]:
     """Gains for each joint: ``firmness`` times the rules. Left and right joints of a pair get equal gains.
 
-    kp [N m/rad]: full effort at a position error of 1 rad. This is within a factor of two of published gains: ANYmal 80
-    at 80 N m (legged_gym), G1's hip and knee 100 and 150 at 88 and 139 N m (unitree_rl_gym), Go2 20 and 40 at 23.5 and
-    45 N m (unitree_rl_mjlab), Go1 35 at 23.7 N m (MuJoCo Playground). A lower bound is the kp that holds twice the
-    torque at rest with an error of 0.4 rad, because in a walk half of the feet carry the robot. Without a known effort,
-    kp is this bound, and at least the kp that swings the limb at 2 Hz.
-    kd [N m s/rad]: 25 ms of kp. Published: ANYmal 2 for kp 80, Go2 0.5 for 20, G1 2 for 100, Booster T1 5 for 200.
-    A robot with more than two feet that does not stand on these gains gets up to twice as much (draft.py).
-    Both are cut for stability: dt sqrt(kp / I) <= 0.5 and dt kd / I <= 0.5, with the joint's smallest inertia I.
+    ``moment`` [N m]: the robot's weight times the height of its root. Published gains go with the motor, and with what
+    a fall of the whole robot asks of it, so kp [N m/rad] is the geometric mean of two: full effort at 1 rad, and 0.4 of
+    the moment at 1 rad. A lower bound is the kp that holds twice the torque at rest with an error of 0.4 rad, because
+    in a walk half of the feet carry the robot. Without a known effort, kp is this bound, and at least the kp that
+    swings the limb at 2 Hz. kd [N m s/rad]: 25 ms of kp. docs/your_own_robot.md has both beside what makers publish.
     """
-    wanted = [firmness * _wanted(joint) for joint in joints]
-    most = [joint.inertia / dt for joint in joints]  # [kg m^2/s]
+    wanted = [firmness * _wanted(joint, moment) for joint in joints]
     gains = []
     for joint in joints:
         alike = [i for i, other in enumerate(joints) if family(other.name) == family(joint.name)]
-        kp, most_kp = max(wanted[i] for i in alike), min(MOST**2 * most[i] / dt for i in alike)
-        cut_kp = min(kp, most_kp)
-        kd, most_kd = DAMPING_TIME * _round(cut_kp), min(MOST * most[i] for i in alike)
-        gains.append(Gains(_round(cut_kp), _round(min(kd, most_kd)), kp > most_kp or kd > most_kd))
+        kp = _round(max(wanted[i] for i in alike))
+        gains.append(Gains(kp, _round(DAMPING_TIME * kp)))
     return gains
 
 
-def _wanted(joint: Joint) -> float:
+def beyond_euler(joints: Sequence[Joint], gains: Sequence[Gains], dt: float) -> list[Joint]:
+    """The joints whose ``gains`` ask for the integrator implicitfast: explicit Euler bears MOST in a substep."""
+    with_gains = [joint._replace(kp=gain.kp, kd=gain.kd) for joint, gain in zip(joints, gains, strict=True)]
+    return [joint for joint in with_gains if max(joint.stiffness_step(dt), joint.damping_step(dt)) > MOST]
+
+
+def _wanted(joint: Joint, moment: float) -> float:
     load = LOAD * abs(joint.torque) / SAG
     if math.isfinite(joint.effort):
-        return max(joint.effort / FULL_EFFORT_AT, load)
+        return max(math.sqrt(joint.effort * UPRIGHT * moment), load)
     return max(joint.held * (2.0 * math.pi * SWING) ** 2, load)
 
 

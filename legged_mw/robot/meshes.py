@@ -22,10 +22,10 @@ def why_unreadable(path: Path) -> str:
     return "" if path.is_file() else "no such file"
 
 
-def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoco.MjModel:
-    """Compile ``spec`` after removing visuals with unreadable files.
+def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str], lost: dict[str, str]) -> mujoco.MjModel:
+    """Compile ``spec`` after removing geoms with unreadable files. ``lost``: see ``RobotFile``.
 
-    Raises ModelError for an unreadable mesh that collides or gives a body its mass, ValueError for any other fault.
+    Raises ModelError for an unreadable mesh that gives a body its mass, ValueError for any other fault.
     """
     try:
         return compile_copy(spec)
@@ -37,19 +37,26 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
         }
         if not any(broken.values()) and not _missing_pictures(spec) and not _missing_skins(spec):
             raise
-    _drop(spec, broken, where, notes)
+    _drop(spec, broken, where, notes, lost)
     _drop_pictures(spec, notes)
     return compile_copy(spec)
 
 
-def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: list[str]) -> None:
-    """Remove meshes and the geoms that show them. ``reasons``: name of the mesh -> reason; empty: keep it."""
+def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: list[str], lost: dict[str, str]) -> None:
+    """Remove meshes and their geoms. ``reasons``: name of the mesh -> reason; empty: keep it."""
     left_out: dict[str, list[str]] = {}
     for mesh in [mesh for mesh in spec.meshes if reasons.get(mesh.name)]:
+        reason, collides = reasons[mesh.name], False
         for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
-            _refuse_what_matters(spec, geom, mesh, reasons[mesh.name], where)
+            _refuse_mass(spec, geom, mesh, reason, where)
+            if geom.contype or geom.conaffinity:
+                collides = True
+                text = f"{where}: {_whats_wrong(spec, geom, 'collides as', mesh, reason)}"
+                lost |= dict.fromkeys((name for name in (geom.name, geom.parent.name) if name), text)
+                notes.append(f"collider of '{geom.parent.name}' left out ({reason}): {mesh.file}")
             spec.delete(geom)
-        left_out.setdefault(reasons[mesh.name], []).append(mesh.file)
+        if not collides:
+            left_out.setdefault(reason, []).append(mesh.file)
         spec.delete(mesh)
     for reason, files in left_out.items():
         notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
@@ -73,18 +80,18 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     return ""
 
 
-def _refuse_what_matters(
-    spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str
-) -> None:
+def _refuse_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str) -> None:
     gives_mass = (
         not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
     )
-    if not (geom.contype or geom.conaffinity or gives_mass):
-        return
+    if gives_mass:
+        raise ModelError(f"{where}: {_whats_wrong(spec, geom, 'takes its mass from', mesh, reason)}")
+
+
+def _whats_wrong(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, role: str, mesh: mujoco.MjsMesh, reason: str) -> str:
     name = f"geom '{geom.name}'" if geom.name else "a geom"
-    role = "collides as" if geom.contype or geom.conaffinity else "takes its mass from"
-    raise ModelError(
-        f"{where}: {name} of body '{geom.parent.name}' {role} the mesh '{mesh.name}', and its file {mesh.file} cannot be read ({reason}; "
+    return (
+        f"{name} of body '{geom.parent.name}' {role} the mesh '{mesh.name}', and its file {mesh.file} cannot be read ({reason}; "
         f"looked for at {path_of(spec, mesh)}); put the file there as one of {', '.join(READABLE)}, or {INSTEAD}"
     )
 

@@ -26,19 +26,31 @@ WIDTH = 140  # [columns] longest line of the config
 _HEAD = '''"""{title} ({legs}, {joints} joints; {file}) follows a joystick on flat ground. Check what is marked LOOK."""
 
 {imports}
-
+{real}
 
 class {name}FlatCfg({cfg}):
 '''
+_REAL = """
+# LOOK, before a real robot, what matters most first:
+# 1. asset.imu_site: place and axes of its IMU. Here: {imu}
+# 2. stiffness, damping: those that its servos will have, and control.action_scale
+# 3. domain_rand.delay_ms: from an action to its torque. Measure it
+# 4. effort: what its motors give. Here: {effort}
+# 5. domain_rand.friction of the ground and asset.frictionloss, asset.armature of its joints
+# 6. domain_rand.base_mass, base_com: what it will carry
+"""
 _COMMENTS = {
     "foot_names": "LOOK: guessed",
     "foot_geoms": "foot -> its geoms",
     "joint_speed_limits": "[rad/s] the file's",
     "colliders": "the feet alone touch the ground",
     "pos": "[m] standing, computed",
-    "stiffness": "[N m/rad] LOOK: computed (legged_mw/robot/measure.py)",
     "damping": "[N m s/rad] LOOK: likewise",
+    "armature": "[kg m^2] of the rotors, published; the file has none",
+    "integrator": "explicit Euler does not bear these gains on such light limbs",
+    "iterations": "with 1 a robot does not even stand under implicitfast [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
+    "clip_actions": "so that a joint is moved by 1 rad at most",
     "lin_vel_x": "[m/s] LOOK: what you want of it",
     "lin_vel_y": "[m/s]",
     "ang_vel_yaw": "[rad/s]",
@@ -50,6 +62,11 @@ _COMMENTS = {
     "enable": "worlds are alike; likewise",
     "base_mass": "[kg] more or less of it",
     "push": "kicks alone; likewise",
+    "delay_ms": "[ms] from an action to its torque",
+    "dof_acc": "no jerks",
+    "feet_impact_vel": "no stamping",
+    "pose": "arms and waist quiet",
+    "feet_orientation": "soles level",
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
     "pose_weights": "how near the default pose each joint is to stay",
     "contact_phase": "one foot after the other; without it and no_fly a beginner hops [ours: docs/lab.md]",
@@ -93,13 +110,19 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
     title = "".join(part.capitalize() for part in name.split("_"))
     base, train = (parent.__name__ for parent in parents(found))
-    names = {"imports": _imports(found), "cfg": base}
+    names = {"imports": _imports(found), "cfg": base, "real": "" if found.simple else _before_a_real_robot(found)}
     lines = [
         _HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title, **names).rstrip("\n")
     ]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
-    comments = {**_COMMENTS, "held_joints": _held(found), "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
+    source = found.gains_from.replace("suggested below", "computed (legged_mw/robot/measure.py)")
+    comments = {
+        **_COMMENTS,
+        "held_joints": _held(found),
+        "default_joint_angles": f"[rad] LOOK: {found.pose_from}",
+        "stiffness": f"[N m/rad] LOOK: {source}",
+    }
     for section, fields in sections.items():
         lines += [f"    class {section}({base}.{section}):"]
         for field, value in fields.items():
@@ -115,14 +138,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
             lines += _force_limits(found)
         lines.append("")
     lines += ["", f"class {title}FlatCfgPPO({train}):"]
-    lines += [f"    class runner({train}.runner):", "        max_iterations = 1500"]
-    if feet == 2:
-        lines += [
-            "",
-            f"    class actor({train}.actor):",
-            f"        class distribution_cfg({train}.actor.distribution_cfg):",
-        ]
-        lines += ["            init_std = 0.6  # at 1.0 it does not learn to follow on a few cores [ours: docs/lab.md]"]
+    lines += _learner(found, train)
     if mirrors != parents(found)[1].symmetry.use_data_augmentation:
         comment = f"left and right are {'alike' if mirrors else 'not alike'}"
         lines += [
@@ -132,6 +148,38 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
         ]
     lines += ["", ""]
     return "\n".join([*lines, f"TASK = Task(LeggedRobot, {title}FlatCfg, {title}FlatCfgPPO)", ""])
+
+
+def _learner(found: Draft, train: str) -> list[str]:
+    """The learner's sections. What is hard for a beginner on a few cores is off there."""
+    std = f"{train}.actor.distribution_cfg"
+    if found.simple:
+        lines = [f"    class runner({train}.runner):", "        max_iterations = 1500"]
+        if len(found.feet) == 2:
+            lines += ["", f"    class actor({train}.actor):", f"        class distribution_cfg({std}):"]
+            lines += [
+                "            init_std = 0.6  # at 1.0 it does not learn to follow on a few cores [ours: docs/lab.md]"
+            ]
+        return lines
+    off = '"domain_rand.enable": False, "perturbation.push": False'
+    lines = [
+        f"    class cpu({train}.cpu):  # on a CPU worlds are alike and nobody pushes: it is to walk within minutes"
+    ]
+    lines += [
+        "        overrides = {",
+        '            "commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',
+    ]
+    if len(found.feet) == 2:
+        off += ', "actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0]'
+    return [*lines, f"            {off},", "        }"]
+
+
+def _before_a_real_robot(found: Draft) -> str:
+    """What a real robot needs to know, in order, as comments."""
+    known = all(joint.effort != float("inf") for joint in found.joints)
+    effort = "the file's limits" if known else "some joints have none, which no motor is"
+    text = _REAL.format(imu=f"site '{found.robot.imu}' of '{found.robot.root}'", effort=effort)
+    return text.rstrip("\n") + "\n"
 
 
 def _imports(found: Draft) -> str:

@@ -11,7 +11,17 @@ import torch
 from legged_mw.check.guard import nothing_changed, tiny_cfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.ranks import this_rank
-from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Gains, Joint, RobotNumbers, Stand, measure, suggest
+from legged_mw.robot.measure import (
+    STAND_SECONDS,
+    STAND_TILT,
+    Gains,
+    Joint,
+    RobotNumbers,
+    Stand,
+    beyond_euler,
+    measure,
+    suggest,
+)
 from legged_mw.utils.errors import in_short, place_of
 from legged_mw.utils.task import LoadedTask
 
@@ -42,7 +52,7 @@ def page(
     poses: Sequence[str] = (),
 ) -> str:
     """The whole page, with lines about guessed values, changes to the robot's file, and poses that were judged."""
-    gains = suggest(health.joints, health.dt)
+    gains = suggest(health.joints, health.moment)
     lines = [f"health of {title}", *(f"  guessed: {line}" for line in guessed), *_summary(health)]
     lines += ["joints", *_table(health, gains), *_LEGEND]
     if poses:
@@ -59,7 +69,7 @@ _LEGEND = (
     "  inertia [kg m^2] that a motor turns while all else is free: the smallest of the poses default, low, middle, high (of all ranges), "
     "and in which;",
     "  dt kd/I: from 1 on it rings, from 2 on it is unstable; dt sqrt(kp/I): unstable from 2 on; ratio: kd / (2 sqrt(kp I));",
-    '  sag [rad] under gravity at rest; effort [N m]; speed [rad/s]; kp [N m/rad]; kd [N m s/rad]; "cut": the step bears no more',
+    "  sag [rad] under gravity at rest; effort [N m]; speed [rad/s]; kp [N m/rad]; kd [N m s/rad]; suggested: kp and kd",
 )
 
 
@@ -125,7 +135,7 @@ def _row(joint: Joint, gain: Gains, health: RobotNumbers) -> tuple[str, ...]:
             f"{joint.effort:g}" if math.isfinite(joint.effort) else "none",
             f"{joint.speed:g}" if math.isfinite(joint.speed) else "?",
         ),
-        *(f"{joint.kp:g}", f"{joint.kd:g}", f"{gain.kp:g} {gain.kd:g}{' cut' if gain.cut else ''}"),
+        *(f"{joint.kp:g}", f"{joint.kd:g}", f"{gain.kp:g} {gain.kd:g}"),
     )
 
 
@@ -163,10 +173,11 @@ def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
         lines.append(
             f"damping turns the velocity's sign in every substep: {_those(rings)}: lower control.damping or sim.dt, or give them armature"
         )
-    if bare := [joint for joint, gain in zip(joints, gains, strict=True) if not joint.armature and gain.cut]:
+    bare = [joint for joint in beyond_euler(joints, gains, dt) if not joint.armature]
+    if bare and not health.implicit:
         lines.append(
-            f"no armature, which limits the gains that the step bears: {_those(bare)}: a geared motor adds its rotor's inertia times "
-            "the gear ratio squared; write that into asset.armature"
+            f"no armature, and the suggested gains are more than a substep bears: {_those(bare)}: set sim.integrator to implicitfast; "
+            "a geared motor adds its rotor's inertia times the gear ratio squared, which asset.armature takes"
         )
     if endless := [joint for joint in joints if not math.isfinite(joint.effort)]:
         lines.append(
@@ -195,7 +206,7 @@ def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
             ends, wrong, odd = first_step(env), list[str](), list[str]()
             if gains:
                 health = measure(env.robot, env.robot.pose, env.start_place, control.decimation)
-                wrong, odd = faults(health), doubtful(health, suggest(health.joints, health.dt))
+                wrong, odd = faults(health), doubtful(health, suggest(health.joints, health.moment))
         except Exception as error:  # a failed check is no fault of the task
             return [], [f"a few robots on their own could not be looked at: {in_short(error)}"]
     return [*([ends] if ends else []), *wrong], odd

@@ -18,11 +18,10 @@ _COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "fals
 SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
 
 
-def read_urdf(source: XmlSource, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
-    """The spec with one body per link, and joint -> speed limit [rad/s].
+def read_urdf(source: XmlSource, notes: list[str], lost: dict[str, str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
+    """The spec with one body per link, and joint -> speed limit [rad/s]. ``lost``: see ``RobotFile``.
 
-    It modifies the tree of ``source``. Raises ValueError for a file that is not a URDF, ModelError for an unreadable
-    collision mesh.
+    It modifies the tree of ``source``. Raises ValueError for a file that is not a URDF.
     """
     file, robot = source.file, source.root
     if any(element.tag.startswith("xacro:") for element in robot.iter()):
@@ -34,7 +33,7 @@ def read_urdf(source: XmlSource, notes: list[str]) -> tuple[mujoco.MjSpec, dict[
     if mimics := [name for name, joint in joints.items() if joint.find("mimic") is not None]:
         notes.append(f"mimic dropped: {', '.join(mimics)} move by themselves")
     _drop_points(robot, file, notes)
-    files = _find_meshes(robot, file, notes)
+    files = _find_meshes(robot, file, notes, lost)
     extension = robot.find("mujoco")
     extension = ElementTree.SubElement(robot, "mujoco") if extension is None else extension
     compiler = extension.find("compiler")
@@ -102,8 +101,8 @@ def _has_no_size(part: Element) -> bool:
     return False
 
 
-def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path]:
-    """Give each mesh a unique name, and return name -> file. Remove visuals without a readable file."""
+def _find_meshes(robot: Element, file: Path, notes: list[str], lost: dict[str, str]) -> dict[str, Path]:
+    """Give each mesh a unique name, and return name -> file. Remove parts without a readable file."""
     compiler, names = robot.find("mujoco/compiler"), dict[Path, str]()
     meshdir = "" if compiler is None else compiler.get("meshdir", "")
     left_out: dict[str, list[str]] = {}
@@ -116,12 +115,15 @@ def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path
             path = _resolve(asked, file, meshdir)
             reason = why_unreadable(path)
             if reason and part.tag == "collision":
-                raise ModelError(
-                    f"{file.name}: link '{link.get('name')}' collides as the mesh {asked}, which cannot be read ({reason}; looked for it "
+                name = link.get("name", "")
+                lost[name] = (
+                    f"{file.name}: link '{name}' collides as the mesh {asked}, which cannot be read ({reason}; looked for it "
                     f"beside {file.name} and in the folders above); put it there as one of {', '.join(READABLE)}, or {SHAPES}"
                 )
-            if reason:
+                notes.append(f"collider of '{name}' left out ({reason}): {asked}")
+            elif reason:
                 left_out.setdefault(reason, []).append(asked)
+            if reason:
                 link.remove(part)
                 continue
             mesh.set("filename", names.setdefault(path, f"{path.stem}_{len(names)}{path.suffix}"))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 from collections.abc import Collection
@@ -34,6 +35,8 @@ from legged_mw.utils.errors import ModelError
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # number of columns in qpos; other joints have one
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_ROUNDING = 1e-9  # of the largest moment of inertia
+_THIN = 1e-3  # a balanced body's thickness squared over its length squared is at least about this [ours]
 _ADDED = {  # attributes of defaults that would apply to elements added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
@@ -50,10 +53,10 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
     """Read an MJCF or URDF, and keep its sensors named in ``wanted``. Raises ModelError if it is not a single robot."""
     if not file.is_file():
         raise ModelError(f"no {kind_of(file)} at {file}")
-    where, notes = file.name, []
+    where, notes, lost = file.name, list[str](), dict[str, str]()
     with naming(file):
         source = XmlSource(file)
-        spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
+        spec, speeds = read_urdf(source, notes, lost) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = _take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
@@ -65,11 +68,11 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         _balance(spec, notes)
         _rename_clashes(spec, notes)
         with warnings.catch_warnings(record=True) as said:
-            model = compile_readable(spec, where, notes)
+            model = compile_readable(spec, where, notes, lost)
         check_model(model)
         notes += [f"warning: {' '.join(str(each.message).split())}" for each in said]
     _check_joints(spec, where)
-    return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors)
+    return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors, lost)
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:
@@ -161,6 +164,7 @@ def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
         spec.delete(body)
     if not spec.worldbody.bodies:
         raise ModelError(f"{where} has no body; it must hold a robot")
+    _drop_spares(spec, notes)
     if len(moving := [body.name for body in spec.worldbody.bodies]) > 1:
         raise ModelError(
             f"{where} has {len(moving)} bodies with joints in its world: {', '.join(moving)}; leave one of them, the robot"
@@ -177,6 +181,18 @@ def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
     if geoms or skies:
         _drop_unused(spec)
     _drop_ties(spec, notes)
+
+
+def _drop_spares(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Drop bodies of the world with a joint and no geom beside a robot: Unitree keeps motors' numbers in order by them."""
+    spare = [body for body in spec.worldbody.bodies if not body.geoms and not body.bodies]
+    if len(spare) == len(spec.worldbody.bodies):
+        return
+    if spare:
+        names = ", ".join(f"'{body.name}'" for body in spare)
+        notes.append(f"bodies of the world dropped: {names}, which have a joint and no geom")
+    for body in spare:
+        spec.delete(body)
 
 
 def _has_joints(body: mujoco.MjsBody) -> bool:
@@ -244,22 +260,45 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
 
 
 def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Let MuJoCo replace principal moments of inertia that violate A + B >= C by their mean, and note that."""
+    """Replace inertias that no body can have by the nearest ones that a body can have, and note before and after.
+
+    Inertias about an axis of the file that are not positive stay, so that MuJoCo refuses them.
+    """
     for body in [body for body in spec.bodies if body.explicitinertial]:
-        full = body.fullinertia
-        if np.isnan(full[0]):
-            moments = np.sort(body.inertia)
+        is_full = not np.isnan(body.fullinertia[0])
+        xx, yy, zz, xy, xz, yz = body.fullinertia if is_full else [*body.inertia, 0.0, 0.0, 0.0]
+        if not (min(xx, yy, zz) > 0.0 and np.isfinite([xx, yy, zz, xy, xz, yz]).all()):
+            continue
+        moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        short = (moments[2] - moments[0] - moments[1]) / moments[2]
+        if short < -_ROUNDING:
+            continue
+        nearest = _nearest_moments(moments, _THIN if short > _ROUNDING else 1e-6)
+        full = axes @ np.diag(nearest) @ axes.T
+        if is_full:
+            body.fullinertia = full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         else:
-            xx, yy, zz, xy, xz, yz = full
-            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        short = moments[2] - moments[0] - moments[1]
-        if short > -1e-9 * moments[2]:
-            spec.compiler.balanceinertia = True
-        if short > 1e-9 * moments[2]:
-            figures = ", ".join(f"{moment:g}" for moment in moments)
-            notes.append(
-                f"inertia of '{body.name}' balanced: no body has the moments {figures} kg m^2, so each becomes their mean"
-            )
+            body.inertia = np.diag(full)
+        if short > _ROUNDING:
+            moments[np.abs(moments) < _ROUNDING * moments[2]] = 0.0
+            before, after = (", ".join(f"{moment:.3g}" for moment in each) for each in (moments, nearest))
+            notes.append(f"inertia of '{body.name}' balanced: no body has the moments {before} kg m^2; now {after}")
+
+
+def _nearest_moments(moments: np.ndarray, thin: float) -> np.ndarray:
+    """The principal moments of inertia (3,) that a body can have and that are nearest to ``moments`` (3,).
+
+    Each is the sum of two second moments of the mass along the axes; those are at least ``thin`` of the largest moment.
+    """
+    sums, least = np.ones((3, 3)) - np.eye(3), thin * moments.max()
+    found = []
+    for free in itertools.product((False, True), repeat=3):  # all others are at the bound
+        second, chosen = np.full(3, least), np.array(free)
+        rest = moments - sums[:, ~chosen].sum(axis=1) * least
+        second[chosen] = np.linalg.lstsq(sums[:, chosen], rest, rcond=None)[0]
+        if second.min() >= least * (1.0 - _ROUNDING):
+            found.append(sums @ second)
+    return min(found, key=lambda each: float(np.linalg.norm(each - moments)))
 
 
 def _rename_clashes(spec: mujoco.MjSpec, notes: list[str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -19,11 +19,13 @@ class GeomNames:
     geoms: tuple[str, ...]  # with a name
     colliding: tuple[str, ...]  # of these, those that may touch
     bodies: dict[str, tuple[str, ...]]  # body -> its colliding geoms; if it has none, those of bodies fixed to it
+    lost: Mapping[str, str]  # of ``RobotFile``
 
     def find(self, patterns: Sequence[str], what: str, colliding: bool = False) -> tuple[str, ...]:
         """The geoms that match ``patterns``, each once, in their order; with ``colliding`` only those that may touch.
 
-        A geom wins over a body of the same name. ``what`` names the caller's parameter in a ModelError.
+        A geom wins over a body of the same name. ``what`` names the caller's parameter in a ModelError. A pattern with
+        * or ? passes over what is ``lost``.
         """
         found: dict[str, None] = {}
         geoms = self.colliding if colliding else self.geoms
@@ -32,9 +34,16 @@ class GeomNames:
             bodies = [] if hits else [name for name in self.bodies if fnmatchcase(name, pattern)]
             hits += [geom for body in bodies for geom in self.bodies[body]]
             if not hits:
+                for name in [name for name in self.lost if fnmatchcase(name, pattern)]:
+                    raise ModelError.of((what, self.lost[name]))
                 raise ModelError.of((what, self._no_geom(pattern, geoms, bodies, colliding)))
             found |= dict.fromkeys(hits)
         return tuple(found)
+
+    def passed_over(self, patterns: Sequence[str]) -> list[str]:
+        """A warning for each ``lost`` collider that a pattern of ``patterns`` fits."""
+        fitting = [text for name, text in self.lost.items() if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        return [f"warning: {text}" for text in dict.fromkeys(fitting)]
 
     def _no_geom(self, pattern: str, geoms: Sequence[str], bodies: Sequence[str], colliding: bool) -> str:
         """Why ``pattern`` has no geom, though it matches ``bodies``."""
@@ -46,7 +55,7 @@ class GeomNames:
         return f"{text}there are: geoms {', '.join(geoms) or 'none'}; bodies {', '.join(self.bodies)}"
 
 
-def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> GeomNames:
+def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str], lost: Mapping[str, str]) -> GeomNames:
     """Name the unnamed colliding geoms ``<body>_<number>``, and list all names."""
     taken = {geom.name for geom in spec.geoms}
     for body in spec.bodies:
@@ -62,7 +71,7 @@ def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> GeomNames:
     named = [geom for geom in spec.geoms if geom.name]
     colliding = [geom.name for geom in named if _collides(geom)]
     bodies = {body.name: tuple(_own(body) or _fixed_to(body)) for body in spec.bodies[1:] if body.name}
-    return GeomNames(where, tuple(geom.name for geom in named), tuple(colliding), bodies)
+    return GeomNames(where, tuple(geom.name for geom in named), tuple(colliding), bodies, lost)
 
 
 def _collides(geom: mujoco.MjsGeom) -> bool:

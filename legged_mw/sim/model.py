@@ -125,12 +125,13 @@ def build_model(
     spec, notes, root = robot.spec, robot.notes, robot.root
     with naming(file):
         posed = pose_joints(robot, {"stiffness": stiffness, "damping": damping, **tables}, pose, held_joints)
-        names = name_geoms(spec, robot.where, notes)
+        names = name_geoms(spec, robot.where, notes, robot.lost)
         imu = "" if imu_site is None else sensed_site(robot, posed.model, imu_site)
         fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
         add_ground(spec, ground, notes)
         _set_collisions(spec, names.find(colliders, "colliders", colliding=True), self_collisions, notes)
+        notes += names.passed_over(colliders)
         if self_collisions:
             _leave_out_neighbours(spec, posed.angles, notes)
         speeds = set_machine(robot, partial, posed, drive)

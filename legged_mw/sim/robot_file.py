@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import XML, Element, ParseError, tostring
 
@@ -52,6 +52,8 @@ class RobotFile:
     speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
     keyframe: Keyframe | None  # "home", or the only one
     sensors: tuple[str, ...] = ()  # names of the file's sensors, kept or dropped
+    # geom or body with a collider that is left out, as its mesh cannot be read -> an error for who needs it
+    lost: dict[str, str] = field(default_factory=dict)
 
     @property
     def root(self) -> str:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
+import os
 import random
 import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from ctypes import ArgumentError
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from legged_mw.utils.config import ConfigError, fit, load_yaml
-from legged_mw.utils.console import patient_console
 from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
@@ -198,3 +199,50 @@ def command(program: str, processes: int = 1) -> str:
         script = f"-m legged_mw.programs {program}" if installed else f"{program}.py"
         return f"torchrun --nproc_per_node={processes} {script}"
     return f"legged-mw {program}" if installed else f"python {program}.py"
+
+
+# ---- a console that may close, as in | head: later prints are lost, the program goes on -----------------------------
+
+
+_GONE = (errno.EPIPE, errno.EIO, errno.EBADF)  # a closed pipe, a terminal that hung up, a closed descriptor
+
+
+class SafeStream:
+    """A stream that drops what cannot be written."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        self._try(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _try(self, call: Callable[..., object], *args: str) -> None:
+        try:
+            call(*args)
+        except ValueError:  # the stream is closed
+            return
+        except OSError as error:
+            if error.errno in _GONE:
+                with suppress(OSError, ValueError):  # Python flushes its buffer at the end, too: send that nowhere
+                    nowhere = os.open(os.devnull, os.O_WRONLY)
+                    os.dup2(nowhere, self._stream.fileno())
+                    os.close(nowhere)
+
+
+@contextmanager
+def patient_console() -> Iterator[None]:
+    """Inside, a print that fails is dropped."""
+    out, err = SafeStream(sys.stdout), SafeStream(sys.stderr)
+    with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
+        try:
+            yield
+        finally:
+            out.flush()
+            err.flush()

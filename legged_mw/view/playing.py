@@ -25,11 +25,10 @@ from torch import Tensor
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.checkpoint import load_tensors, save_whole
 from legged_mw.rl.flags import require_task
 from legged_mw.rl.learner_config import check_classes
 from legged_mw.rl.policies import PolicySource, actor_in, introduce, load_policy
-from legged_mw.rl.run_folder import checkpoints, reason_of
+from legged_mw.rl.run_folder import checkpoints, load_tensors, reason_of, save_whole
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
@@ -63,6 +62,13 @@ NOMINAL = {  # overrides of the trained config for playing
 ROWS, BORDER = 3, 2.0  # of the terrain: levels from the easiest to the hardest, border [m]
 
 
+OF_THE_EXAM = {
+    "compare": "grades two policies side by side",
+    "ranges": "says what the exam asks",
+    "no_hard": "leaves a part of the exam out",
+}
+
+
 def parse(description: str | None) -> argparse.Namespace:
     """Parse the flags of play."""
     parser = make_parser(description)
@@ -88,6 +94,7 @@ def parse(description: str | None) -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
+    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam, in half the time")
     parser.add_argument(
         "--export",
         metavar="DIR",
@@ -103,10 +110,9 @@ def parse(description: str | None) -> argparse.Namespace:
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
-    if args.compare is not None and not args.eval:
-        parser.error("--compare grades two policies side by side: add --eval")
-    if args.ranges and not args.eval:
-        parser.error("--ranges says what the exam asks: add --eval")
+    for name, why in OF_THE_EXAM.items():
+        if getattr(args, name) not in (None, False) and not args.eval:
+            parser.error(f"--{name} {why}: add --eval")
     if args.follow and (args.eval or args.export or args.checkpoint != -1):
         parser.error("--follow watches the newest policy: leave --eval, --export and --checkpoint out")
     if args.export and (args.set or args.override or args.command is not None):

@@ -31,7 +31,7 @@ from legged_mw import ROOT
 from legged_mw.deploy.contract import NetworkMotors, checksum, edits, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.simulated import Fleet
-from legged_mw.rl.checkpoint import save_whole
+from legged_mw.rl.run_folder import save_whole
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils.config import load_yaml

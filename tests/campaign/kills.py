@@ -23,8 +23,7 @@ sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1]), 
 from program import SMALL, assert_equal, run  # noqa: E402
 from test_resume import EXACTLY  # noqa: E402
 
-from legged_mw.rl.checkpoint import damage  # noqa: E402
-from legged_mw.rl.run_folder import checkpoints  # noqa: E402
+from legged_mw.rl.run_folder import checkpoints, damage  # noqa: E402
 
 FLAGS = ["--seed", "5", "--eager", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
 

@@ -21,12 +21,12 @@ from test_resume import EXACTLY
 from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT
-from legged_mw.rl import checkpoint, training
+from legged_mw.rl import run_folder, training
 from legged_mw.rl.ranks import Rank
 from legged_mw.rl.run_folder import LOCK_FILE, CheckpointWriter, RunLock, checkpoints
 from legged_mw.rl.runner import Runner
+from legged_mw.utils.cli import SafeStream
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.console import SafeStream
 
 RUN = ["--seed", "1", "--eager", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
 GO_ON = ["--task", "go1_flat", "--device", "cpu", "--resume"]
@@ -70,7 +70,7 @@ def test_a_checkpoint_that_cannot_be_written_is_said_and_the_next_one_tried(
             raise OSError(code, os.strerror(code))
         replace(source, target)
 
-    monkeypatch.setattr(checkpoint.os, "replace", fail)
+    monkeypatch.setattr(run_folder.os, "replace", fail)
     worlds = list[list[str]]()
     before_iteration(monkeypatch, lambda *_: worlds.append([path.name for path in only_run(tmp_path).glob("worlds_*")]))
     result = train(tmp_path, 4)
@@ -94,7 +94,7 @@ def test_a_full_disk_keeps_the_newest_that_could_be_written(tmp_path: Path, monk
 
     def fill(_: Runner, iteration: int) -> None:
         if iteration == 3:
-            monkeypatch.setattr(checkpoint, "open", lambda path, mode: Full(path, mode), raising=False)
+            monkeypatch.setattr(run_folder, "open", lambda path, mode: Full(path, mode), raising=False)
             monkeypatch.setattr(RecordWriter, "write", lambda *_: Full(tmp_path / "curve", "wb").write(b""))
 
     before_iteration(monkeypatch, fill)
@@ -156,7 +156,7 @@ def test_a_logger_that_does_not_start_ends_nothing(tmp_path: Path, monkeypatch: 
 
 def test_what_nobody_reads_is_lost(tmp_path: Path) -> None:
     """The pipe to a pager that was closed; then even the end of the program finds nothing wrong."""
-    program = "import sys\nfrom legged_mw.utils.console import patient_console\nwith patient_console():\n"
+    program = "import sys\nfrom legged_mw.utils.cli import patient_console\nwith patient_console():\n"
     program += (
         "    for i in range(20000):\n        print('a line', i)\n    open(sys.argv[1], 'w').write('got to its end')"
     )

@@ -13,8 +13,7 @@ import torch
 from program import SMALL, Result, assert_equal, load, refused, run, trained
 
 from legged_mw.envs.snapshot import beyond
-from legged_mw.rl.checkpoint import check_fit, save_whole
-from legged_mw.rl.run_folder import CheckpointWriter, checkpoints
+from legged_mw.rl.run_folder import CheckpointWriter, check_fit, checkpoints, save_whole
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = [
@@ -86,6 +85,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(name: str, tmp_path: Path) 
     assert result.code == 0 and EXACTLY in result.out, result
     assert_equal(load(killed / "model_3.pt"), load(whole / "model_3.pt"))
     resumed, uninterrupted = (load(folder / "worlds_3.pt") for folder in (killed, whole))
+    assert resumed["device"] == "cpu"
     resumed["worlds"] = {name: resumed["worlds"][name] for name in uninterrupted["worlds"]}  # loading wrote more
     assert_equal(resumed, uninterrupted)
 

@@ -14,7 +14,7 @@ from legged_mw.fast import quick_start
 from legged_mw.utils.machine import settle
 
 ASKED_LATER = """
-import sys, gc
+import os, sys, gc
 from legged_mw.utils.machine import settle
 from legged_mw.fast import quick_start
 quick_start.begin()
@@ -43,6 +43,7 @@ torch.distributed.init_process_group("gloo", **group)
 torch.distributed.destroy_process_group()
 later = sys.modules["torch._dynamo"]
 assert later is torch._dynamo and "torch._dynamo.eval_frame" not in sys.modules and "sympy" not in sys.modules
+assert os.path.isfile(later.__file__) and os.path.isfile(later.trace_rules.__file__)
 settle()
 assert gc.isenabled() and gc.get_freeze_count() > 10_000
 
@@ -53,6 +54,7 @@ real = sys.modules["torch._dynamo"]
 assert later.trace_rules.lookup is real.trace_rules.lookup and real.trace_rules is sys.modules["torch._dynamo.trace_rules"]
 assert real is torch._dynamo is not later and real.config is config is sys.modules["torch._dynamo.config"]
 assert config.__spec__.loader is not None and later.config is config
+assert real.eval_frame.config is config  # it has run once
 assert not hasattr(marked, "__dynamo_disable")
 from tensordict.base import _foreach_copy_compiled as first
 assert id(first) in real.trace_rules._allowed_callable_ids

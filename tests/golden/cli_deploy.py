@@ -24,6 +24,10 @@ go1_flat go2_flat
 go1_flat go1_flat --switch fall --eval
 go1_flat go1_flat --switch fall --robot unitree
 go1_flat --ranges common
+go1_flat --no_hard
+go1_flat --scene nosuch.xml
+go1_flat --scene nosuch.xml --drive
+go1_getup --scene nosuch.xml --eval
 go1_flat --command=0,0,0 --commands a.yaml
 go1_flat --eval --out folder
 go1_flat --check_joints --command=0,0,0

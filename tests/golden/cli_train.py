@@ -157,6 +157,7 @@ PLAY = [
             "--eval --export out",
             "--compare x",
             "--ranges common",
+            "--no_hard",
             "--follow --eval",
             "--export out --set env.num_envs=3",
         )

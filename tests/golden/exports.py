@@ -20,8 +20,8 @@ from legged_mw.envs.observations import Row
 from legged_mw.export import exporter as exporting
 from legged_mw.export.exporter import export
 from legged_mw.export.scene import among_steps, standalone
+from legged_mw.rl.policies import begin_with
 from legged_mw.rl.run_folder import RunLock, update_from_run
-from legged_mw.rl.transfer import begin_with
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task

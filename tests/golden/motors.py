@@ -68,9 +68,14 @@ def table() -> Table:
     made = Table()
     for name, make in ARRAYS.items():
         made.add(f"file with {name}", lambda root: read_network(Path("net.npz")), saved(make))
-    made.add(
-        "file of text", lambda root: read_network(Path("net.pt")), lambda root: (root / "net.pt").write_bytes(b"PK no")
-    )
+    for name, given in {
+        "of text": lambda root: (root / "net.pt").write_bytes(b"PK no"),
+        "of nothing": lambda root: (root / "net.pt").touch(),
+        "of one array": lambda root: np.save((root / "net.pt").open("wb"), np.zeros(3)),
+        "of TorchScript": scripted(nn.Linear(2, 1)),
+        "of weights": lambda root: torch.save(nn.Linear(2, 1).state_dict(), root / "net.pt"),
+    }.items():
+        made.add(f"file {name}", lambda root: read_network(Path("net.pt")), given)
     made.add(
         "weights without code",
         lambda root: actuator_net.convert(Path("net.pt")),

@@ -118,28 +118,14 @@ ENVIRONMENTS = {
     },
 }
 HEAVY = {  # a reward that a CUDA graph cannot record
-    "item": "self.dof_vel[:, 0] * self.dof_vel.max().item()",
     "cpu": "self.dof_vel[:, 0].cpu()",
     "numpy": "torch.as_tensor(self.dof_vel[:, 0].numpy())",
     "tolist": "torch.tensor(self.dof_vel[:, 0].tolist())",
-    "a new tensor": "self.rew_buf + torch.tensor(3.0)",
-    "nonzero": "self.rew_buf * len(self.dof_vel.nonzero())",
-    "a mask": "self.rew_buf + self.dof_vel[self.dof_vel > 0].sum()",
-    "an if": "self.rew_buf if self.rew_buf.sum() > 0 else self.rew_buf * 2",
-    "a write": "self.dof_vel.zero_()[:, 0]",
     "int": "self.rew_buf * int(self.rew_buf[0])",
     "a print": "print(self.rew_buf) or self.rew_buf",
     "a helper's mask": "self.rew_buf.masked_select(self.rew_buf > 0).sum() + self.rew_buf",
 }
 METHODS = {
-    "a buffer bound anew": method(
-        "def _update_state(self):\n    super()._update_state()\n    self.rew_buf = self.rew_buf * 1"
-    ),
-    "a number that changes": method(
-        "def _update_state(self):\n    super()._update_state()\n    self.count = getattr(self, 'count', 0) + 1"
-    ),
-    "a row that is made anew": rows("mine.append(Row('x', self.dof_pos * 1.0))"),
-    "a row beyond": rows("mine.append(Row('x', self.dof_pos * 1e30))"),
     "an old name": method("def _observation_rows(self):\n    return {}"),
     "a row twice": rows("mine.append(Row('dof_pos', torch.zeros(4, 12)))"),
     "a group of its own noise": rows("table['mine'] = ['state', Row('y', torch.zeros(4, 1))]"),
@@ -148,7 +134,6 @@ METHODS = {
     ),
     "no torques": method("def _compute_torques(self, actions):\n    return None"),
     "torques that divide": method("def _compute_torques(self, actions):\n    return actions / (actions - actions)"),
-    "a row that must not move": rows("mine.append(Row('x', self.dof_pos.clone()))"),
 }
 
 

@@ -8,10 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from attack import program
+from test_sim import build_toy
 from worlds import make_env
 
 from golden.table import Run, Table
 from legged_mw import ROOT
+from legged_mw.robot.draft import draft
 from legged_mw.sim.model import read_file
 
 GO1 = (ROOT / "resources/robots/go1/go1.xml").read_text()
@@ -231,9 +233,6 @@ TEXTS = {
         "",
         '<asset><mesh name="hull" file="hull.stl"/></asset>',
     ),
-    "a mesh that touches": TOY.format(
-        '<geom type="mesh" mesh="hull" mass="0"/>', "", '<asset><mesh name="hull" file="hull.stl"/></asset>'
-    ),
 }
 MINI = """<robot name="mini"><link name="base">{}<inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
@@ -241,12 +240,24 @@ MINIS = {
     "xacro": '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="a"><xacro:macro name="x"/></robot>',
     "not closed": '<robot name="mini"><link name="base"></robot>',
     "a shape of no size": MINI.format('<collision><geometry><sphere radius="0"/></geometry></collision>'),
-    "a mesh that is no file": MINI.format(
-        '<collision><geometry><mesh filename="package://a/b.stl"/></geometry></collision>'
+}
+MESH_OF = '<collision><geometry><mesh filename="package://a/b{}"/></geometry></collision>'
+LOST: dict[str, tuple[str, str]] = {  # a file whose leg is a mesh that cannot be read, and its text
+    "a geom": (
+        "robot.xml",
+        TOY.format(
+            '<geom type="mesh" mesh="hull" mass="0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>',
+            "",
+            '<asset><mesh name="hull" file="hull.stl"/></asset>',
+        ).replace('<geom name="shin" size="0.05" pos="0 0 -0.2" mass="1"/>', ""),
     ),
-    "a mesh that is not there": MINI.format(
-        '<collision><geometry><mesh filename="package://a/b.dae"/></geometry></collision>'
-    ),
+    **{
+        f"a link, {ending}": (
+            "robot.urdf",
+            PLAIN.replace("</inertial></link>", f"</inertial>{MESH_OF.format(ending)}</link>"),
+        )
+        for ending in (".stl", ".ply")
+    },
 }
 WHOLE = ("control.stiffness", "control.damping", "control.action_scale", "rewards.pose_weights")  # tables of all joints
 SILENT = ("init_state.default_joint_angles", "asset.joint_speed_limits")
@@ -273,6 +284,14 @@ FIELDS = {  # of go1_flat
 }
 
 
+def collide_with_leg(file: Path) -> object:
+    return build_toy(
+        file,
+        **{"stiffness": {"": 10.0}, "damping": {"": 0.2}, "imu_site": "", "velocity_sites": []},
+        **{"colliders": ["leg"], "contact_geoms": ["leg"]},
+    )
+
+
 def table() -> Table:
     made = Table()
     for name, text in MJCFS.items():
@@ -285,6 +304,9 @@ def table() -> Table:
         made.add(f"toy, {name}", reads(), given(text))
     for name, text in MINIS.items():
         made.add(f"mini, {name}", reads("robot.urdf"), given(text, "robot.urdf"))
+    for name, (file, text) in LOST.items():
+        made.add(f"lost, {name}", lambda root, file=file: collide_with_leg(root / file), given(text, file))
+    made.add("lost, a foot", lambda root: draft(root / "robot.urdf"), given(LOST["a link, .stl"][1], "robot.urdf"))
     made.add("no URDF", reads("none.urdf"))
     for name, fields in FIELDS.items():
         made.add(f"go1_flat, {name}", lambda root, fields=fields: make_env(1, fields))

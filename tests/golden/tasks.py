@@ -24,11 +24,10 @@ from legged_mw.envs.mirror import Mirror
 from legged_mw.eval.exams import find_exam, require_exam
 from legged_mw.eval.rough import make_room
 from legged_mw.eval.walking import ExamRules, in_common
-from legged_mw.rl.policies import PolicySource, Trained, find_rival
+from legged_mw.rl.policies import PolicySource, Trained, check_start, find_rival
 from legged_mw.rl.ppo import mirror
 from legged_mw.rl.ranks import Rank, rank_device
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import check_start
 from legged_mw.utils.commands import Command
 from legged_mw.utils.task import LoadedTask, Task, load_task
 from legged_mw.view.drive import parse_command
@@ -276,6 +275,11 @@ def table() -> Table:
     for name, (task, fields) in {
         "a pull on another body": ("go1_getup", {"falls.pull_on": "nose"}),
         "a pull at the root": ("go1_getup", {"falls.pull": 0.5, "falls.pull_on": "", "perturbation.kick": True}),
+        "a share above 1": ("go1_getup", {"falls.share": 1.5}),
+        "no states": ("go1_getup", {"falls.states": 0}),
+        "a pull down": ("go1_getup", {"falls.pull": -1.0}),
+        "a nose to no side": ("go1_handstand", {"exam.nose": 0.0}),
+        "no hands": ("go1_handstand", {"exam.hands": []}),
         "hands that are not there": ("go1_handstand", {"exam.hands": ["nose"]}),
         "a command outside": ("go1_flat", {"commands.default": {"lin_vel_x": 9.0}}),
     }.items():

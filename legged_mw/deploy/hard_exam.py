@@ -1,0 +1,315 @@
+"""Run the hard exam of ``legged_mw.eval.hard`` on an export: all conditions side by side, then one robot to look at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
+from legged_mw.deploy.robot import Floats, Measurement
+from legged_mw.deploy.simulated import Fleet, lowest_point
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.eval import hard
+from legged_mw.eval.hard import CONDITIONS, NOISE, Walk
+from legged_mw.eval.walking import GRAVITY, ExamRules
+from legged_mw.utils.commands import VELOCITY
+
+LOOK_SECONDS = 10.0  # [s] that one robot is looked at, the settling time included
+PICTURES, WIDTH, HEIGHT = 6, 240, 260  # of a strip, over one stride; [px] of each
+SEED = 1  # of the noise
+
+
+def run_hard(
+    folder: Path, rules: ExamRules, walks: bool, edited: bool = False, scene: str | Path = SCENE_FILE
+) -> tuple[dict[str, Any], list[Floats]]:
+    """The hard exam's result, and qpos (nq,) of the robot at PICTURES moments of a stride; none if it fell.
+
+    ``walks``: by the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. Raises ContractError, UserError.
+    """
+    contract = read_contract(folder, edited)
+    load = hard.load_of(rules, contract.mass)
+    conditions = run_conditions(folder, contract, rules, load, edited, scene)
+    walk, poses = look(folder, contract, rules, edited, scene)
+    found = hard.looks(walk) if walk else None
+    return hard.finish(rules, walks, conditions, found, len(contract.feet), load), poses
+
+
+# ---- the conditions -------------------------------------------------------------------------------------------------
+
+
+def run_conditions(
+    folder: Path,
+    contract: Contract,
+    rules: ExamRules,
+    load: float,
+    edited: bool = False,
+    scene: str | Path = SCENE_FILE,
+) -> dict[str, Any]:
+    """Condition -> falls, errors, drift and pushes; each condition has its own range of worlds."""
+    asked = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
+    count = len(asked) * len(CONDITIONS)
+    wanted = commands_of(contract, asked * len(CONDITIONS))
+    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
+    stage = DeployStage(folder, count, ends=ends, scene_file=scene, edited=edited)
+    apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(asked)), load)
+    fell_at, velocity, position = np.full(count, math.inf), [], []
+    for step in range(round(hard.SECONDS / stage.dt)):
+        velocity.append(stage.velocity())
+        position.append(stage.qpos()[:, :2])
+        _push(stage, step, len(asked), hard.push_speed(len(contract.feet)))
+        stage.step(wanted)
+        fell_at[stage.fell() & np.isinf(fell_at)] = step
+    speeds, places, results = np.stack(velocity), np.stack(position), {}
+    for i, condition in enumerate(CONDITIONS):
+        own = slice(i * len(asked), (i + 1) * len(asked))
+        results[condition.name] = hard.grade_condition(rules, speeds[:, own], places[:, own], fell_at[own], stage.dt)
+    return results
+
+
+def commands_of(contract: Contract, velocities: Sequence[Sequence[float]]) -> Floats:
+    """Commands (N, C) with these vx, vy, yaw rates (N, 3) and the defaults of all others."""
+    names = [command.name for command in contract.commands]
+    wanted = np.tile([command.default for command in contract.commands], (len(velocities), 1))
+    wanted[:, [names.index(name) for name in VELOCITY]] = velocities
+    return wanted
+
+
+def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float) -> None:
+    """Give world i the condition ``CONDITIONS[which[i]]``; ``load`` [kg] is added to the heaviest body."""
+    fleet = stage.fleet
+    fleet.set_delay(np.array([each.delay / 1000.0 for each in CONDITIONS])[which])
+    fleet.scale_gains(np.array([each.gains for each in CONDITIONS])[which])
+    fleet.add_load(trunk_of(fleet.model), np.array([load * each.loaded for each in CONDITIONS])[which])
+    friction = [math.nan if each.friction is None else each.friction for each in CONDITIONS]
+    fleet.set_friction(np.array(friction)[which])
+    noisy, random = np.array([float(each.noisy) for each in CONDITIONS])[which][:, None], np.random.default_rng(SEED)
+
+    def disturb(measured: Measurement) -> Measurement:
+        shapes = {name: getattr(measured, name).shape for name in NOISE}
+        noise = {name: noisy * random.uniform(-NOISE[name], NOISE[name], shape) for name, shape in shapes.items()}
+        return replace(measured, **{name: getattr(measured, name) + value for name, value in noise.items()})
+
+    stage.disturb = disturb
+
+
+def trunk_of(model: mujoco.MjModel) -> int:
+    """The heaviest body: the trunk of a quadruped, the torso of a humanoid."""
+    return int(np.argmax(model.body_mass))
+
+
+def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
+    """At step k of the pushes, push one robot of each condition in direction k."""
+    k = step - round(hard.PUSH_AT / stage.dt)
+    if not 0 <= k < hard.PUSH_DIRECTIONS:
+        return
+    angle = 2.0 * math.pi * k / hard.PUSH_DIRECTIONS
+    for i in range(len(CONDITIONS)):
+        world = (i + 1) * worlds - hard.PUSH_DIRECTIONS + k
+        stage.push(world, [speed * math.cos(angle), speed * math.sin(angle)])
+
+
+# ---- one robot that is looked at ------------------------------------------------------------------------------------
+
+
+def look(
+    folder: Path, contract: Contract, rules: ExamRules, edited: bool = False, scene: str | Path = SCENE_FILE
+) -> tuple[Walk | None, list[Floats]]:
+    """A walk straight ahead at half of the highest vx, and poses of one stride; None if the robot falls."""
+    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
+    witness: list[Witness] = []
+    stage = DeployStage(
+        folder,
+        1,
+        threads=1,
+        scene_file=scene,
+        ends=ends,
+        change=_solve_well,
+        edited=edited,
+        each=lambda: witness[0].sample(),
+    )
+    witness.append(Witness(stage.fleet))
+    wanted = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
+    targets, poses, settled = [], [], round(hard.SETTLING / stage.dt)
+    for step in range(round(LOOK_SECONDS / stage.dt)):
+        stage.step(wanted)
+        if stage.fell()[0]:
+            return None, []
+        if step == settled - 1:
+            witness[0].forget()
+        if step >= settled:
+            targets.append(stage.controller.last_targets[0].copy())
+            poses.append(stage.qpos()[0])
+    walk = witness[0].walk(np.array(targets))
+    rate = hard.looks(walk)["strides"] or 1.0
+    stride = np.linspace(0.0, min(1.0 / rate / stage.dt, len(poses)), PICTURES, endpoint=False).astype(int)
+    return walk, [poses[len(poses) - 1 - stride[-1] + i] for i in stride]
+
+
+def _solve_well(model: mujoco.MjModel) -> None:
+    """MuJoCo's own iterations: after training's single one a foot's force is a matter of chance, up to 12 weights."""
+    model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
+
+
+class Witness:
+    """Samples everything that ``hard.looks`` reads, of one robot, once a physics step."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        """``fleet`` has one robot, in its start pose, and calls ``sample`` each physics step."""
+        self.fleet, self.model, contract = fleet, fleet.model, fleet.contract
+        self.trunk, self.feet = trunk_of(fleet.model), feet_of(fleet)
+        self._joints = [self.model.joint(name).id for name in contract.joints]
+        self._dofs, self._angles = self.model.jnt_dofadr[self._joints], self.model.jnt_qposadr[self._joints]
+        self._damping = contract.damping if fleet.damps_by_joint else np.zeros(len(self._joints))
+        bodies = [self.trunk, *(int(self.model.geom_bodyid[geoms[0]]) for geoms in self.feet)]
+        start = mujoco.MjData(self.model)
+        start.qpos[:] = fleet.qpos[0]
+        mujoco.mj_kinematics(self.model, start)
+        # the world's axes in each body's frame, as it stands: (1 + F, 3, 3)
+        self._bodies, self._level = bodies, start.xmat[bodies].reshape(-1, 3, 3).transpose(0, 2, 1).copy()
+        self._data, self._now = mujoco.MjData(self.model), mujoco.MjData(self.model)
+        self._rows: list[dict[str, Floats]] = []
+
+    def forget(self) -> None:
+        """Begin the record anew."""
+        self._rows = []
+
+    def sample(self) -> None:
+        """Keep this physics step."""
+        data, now = self._data, self._now
+        self.fleet.read_data(data)
+        now.qpos[:] = data.qpos
+        mujoco.mj_kinematics(self.model, now)
+        turned = now.xmat[self._bodies].reshape(-1, 3, 3) @ self._level  # (1 + F, 3, 3) how each has turned
+        up = turned[0].T @ [0.0, 0.0, 1.0]
+        x, y = now.qpos[:2]
+        heading = math.atan2(turned[0][1, 0], turned[0][0, 0])
+        places = np.array([now.geom_xpos[geoms].mean(axis=0) for geoms in self.feet]).reshape(-1, 3)
+        sideways = math.cos(heading) * (places[:, 1] - y) - math.sin(heading) * (places[:, 0] - x)
+        torque = data.qfrc_actuator[self._dofs] - self._damping * data.qvel[self._dofs]
+        self._rows.append(
+            {
+                "tilt": np.array([math.atan2(up[1], up[2]), math.atan2(-up[0], up[2])]),
+                "sideways": sideways,
+                "height": np.array([min(lowest_point(self.model, now, geom) for geom in each) for each in self.feet]),
+                "sole": np.arccos(np.clip(turned[1:, 2, 2], -1.0, 1.0)),
+                "force": self._forces(data),
+                "angle": now.qpos[self._angles].copy(),
+                "torque": torque,
+                "speed": data.qvel[self._dofs].copy(),
+            }
+        )
+
+    def _forces(self, data: mujoco.MjData) -> Floats:
+        """(F,) [N] of the ground on each foot, in the last physics step."""
+        total, force = np.zeros((len(self.feet), 3)), np.zeros(6)
+        for i, contact in enumerate(data.contact):
+            pair = [int(geom) for geom in contact.geom]
+            if 0 not in self.model.body_weldid[self.model.geom_bodyid[pair]]:
+                continue
+            for foot, geoms in enumerate(self.feet):
+                if not {*pair} & {*geoms}:
+                    continue
+                mujoco.mj_contactForce(self.model, data, i, force)
+                total[foot] += contact.frame.reshape(3, 3).T @ force[:3]
+        return np.linalg.norm(total, axis=1)
+
+    def walk(self, targets: Floats) -> Walk:
+        """The record, with the policy's ``targets`` (P, D)."""
+        kept: dict[str, Any] = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
+        if not all(has_sole(self.model, geoms) for geoms in self.feet):
+            kept["sole"] = None
+        model, contract = self.model, self.fleet.contract
+        limited = model.jnt_limited[self._joints] > 0
+        low, high = model.jnt_range[self._joints].T
+        return Walk(
+            dt=model.opt.timestep,
+            period=contract.period,
+            weight=float(model.body_subtreemass[0]) * GRAVITY,
+            target=targets,
+            low=np.where(limited, low, -np.inf),
+            high=np.where(limited, high, np.inf),
+            limit=torque_limits(model, self._joints),
+            joints=contract.joints,
+            clock=1.0 / contract.gait.period if contract.gait else None,
+            **kept,
+        )
+
+
+def feet_of(fleet: Fleet) -> list[list[int]]:
+    """The geoms of each foot: those that its contact sensors feel."""
+    feet = fleet.contract.feet.values()
+    return [[int(fleet.model.sensor(name).objid[0]) for name in names] for names in feet]
+
+
+def has_sole(model: mujoco.MjModel, geoms: Sequence[int]) -> bool:
+    """Whether a foot is flat: more than one sphere."""
+    return len(geoms) > 1 or model.geom_type[geoms[0]] != mujoco.mjtGeom.mjGEOM_SPHERE
+
+
+def torque_limits(model: mujoco.MjModel, joints: Sequence[int]) -> Floats:
+    """(D,) [N m] the lowest limit of each joint: its own, or its actuator's; infinite without one."""
+    found = np.where(model.jnt_actfrclimited[joints] > 0, np.abs(model.jnt_actfrcrange[joints]).max(axis=1), np.inf)
+    for i, joint in enumerate(joints):
+        for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
+            gear = abs(model.actuator_gear[actuator, 0])
+            if model.actuator_forcelimited[actuator]:
+                found[i] = min(found[i], gear * np.abs(model.actuator_forcerange[actuator]).max())
+    return found
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+
+VIEWS = {"side": 90.0, "front": 180.0}  # [deg] azimuth of the camera: from the robot's right, and towards it
+
+
+def strip_png(folder: Path, contract: Contract, poses: Sequence[Floats]) -> bytes:
+    """A PNG of one stride: a row from the side and a row from the front. Empty without poses, or without OpenGL."""
+    from legged_mw.view.recorder import contact_sheet, save_png  # imports OpenGL
+    from legged_mw.view.stage import ViewError
+
+    if not poses:
+        return b""
+    try:
+        frames = _frames(Fleet(folder, contract, 1, threads=1).model, poses)
+    except ViewError as error:
+        print(f"no strip of pictures: {error}")
+        return b""
+    with TemporaryDirectory() as place:
+        save_png(path := Path(place) / "strip.png", contact_sheet(frames, PICTURES))
+        return path.read_bytes()
+
+
+def _frames(model: mujoco.MjModel, poses: Sequence[Floats]) -> list[NDArray[np.uint8]]:
+    """A picture of each pose from each of VIEWS. Raises ViewError."""
+    from legged_mw.view.posed_robot import show_groups
+    from legged_mw.view.recorder import no_context
+    from legged_mw.view.stage import ViewError
+
+    data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()
+    show_groups(option)
+    model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
+    try:
+        renderer = mujoco.Renderer(model, height=HEIGHT, width=WIDTH)
+    except Exception as error:  # each OpenGL backend raises another type
+        raise ViewError(no_context(error)) from error
+    frames, tall = [], max(pose[2] for pose in poses)
+    for azimuth in VIEWS.values():
+        for pose in poses:
+            data.qpos[:] = pose
+            mujoco.mj_forward(model, data)
+            camera.lookat[:] = [pose[0], pose[1], 0.75 * tall]
+            camera.distance, camera.azimuth, camera.elevation = 1.6 * tall + 0.7, azimuth, -8.0
+            mujoco.mjv_updateCamera(model, data, camera, renderer.scene)
+            renderer.update_scene(data, camera, option)
+            frames.append(renderer.render())
+    renderer.close()
+    return frames

@@ -1,0 +1,247 @@
+"""A scene of the user's, such as a vendor's own MJCF, made into one that an export can run in.
+
+Joints are found by name. Its actuators are replaced by position servos with the contract's gains and the torque limits
+of the file; the sensors of the contract are added. Masses, contacts, joint friction, solver and time step stay. The
+file is read as every stranger's: ``legged_mw.robot.mjcf`` refuses what no robot needs, and nothing in it is run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from legged_mw.deploy.contract import SCENE_FILE, Contract, compile_scene, part
+from legged_mw.robot.mjcf import XmlSource, check_model
+from legged_mw.utils.errors import UserError, unknown
+
+HOME = "home"  # keyframe with the start pose
+_LOW = 0.01  # [m] of a foot's body: what reaches down to within this of its lowest point is the foot
+_OBJECT, _SENSOR = mujoco.mjtObj, mujoco.mjtSensor
+Lowest = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
+
+
+def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[mujoco.MjSpec, Contract]:
+    """The scene in ``file`` for the export in ``folder``, and its contract there: time step, mass, sensors and feet.
+
+    ``lowest``: height of a geom's lowest point [m]. Raises UserError.
+    """
+    if not file.is_file():
+        raise UserError(f"--scene: no file {file}")
+    if contract.motors.law != "servo":
+        raise UserError(f"--scene: the policy drives motors of the law '{contract.motors.law}'; a scene gets servos")
+    try:
+        source = XmlSource(file)
+        if source.root.tag != "mujoco":
+            raise ValueError(f"its first element is <{source.root.tag}>; a scene is an MJCF with the element <mujoco>")
+        spec = source.spec()
+        limits = _drop_motors(spec)
+        _find_joints(spec, file, contract)
+        _make_ready(spec, contract, limits)
+        own = compile_scene(part(folder, SCENE_FILE))
+        imu = _find_imu(spec, own, contract)
+        _stand(spec, contract, lowest)
+        feet = _find_feet(spec, own, contract, lowest)
+        sensors = _add_sensors(spec, contract, imu)
+        model = spec.compile()
+        check_model(model)
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, UserError):
+            raise
+        why = str(error).partition("The visual elements of the spec")[0]
+        raise UserError(f"--scene: {file.name} is not a valid MJCF: {' '.join(why.split())}") from None
+    return spec, _in_scene(model, file, contract, sensors, feet)
+
+
+def _in_scene(
+    model: mujoco.MjModel,
+    file: Path,
+    contract: Contract,
+    sensors: dict[str, tuple[str, ...]],
+    feet: dict[str, tuple[str, ...]],
+) -> Contract:
+    """The contract with what is the scene's."""
+    steps = contract.period / model.opt.timestep
+    if steps < 0.999 or abs(steps - round(steps)) > 1e-3:
+        raise UserError(
+            f"--scene: {file.name} has a time step of {model.opt.timestep:g} s, of which no whole number is the policy's period of "
+            f'{contract.period:g} s; write one in it: <option timestep="{contract.timestep:g}"/>'
+        )
+    kept = {row.name: row.sensors for row in contract.rows if row.sensors}
+    names = [model.sensor(i).name for i in range(model.nsensor)]
+    for row, wanted in kept.items():
+        for name in wanted:
+            if name not in names:
+                raise UserError(f"--scene: observation row '{row}': {unknown('sensor', name, names, file.name)}")
+    return replace(
+        contract,
+        timestep=float(model.opt.timestep),
+        decimation=round(steps),
+        mass=float(model.body_subtreemass[0]),
+        sensors=sensors,
+        feet=feet,
+        ends=contract.ends._replace(falls_on=()),  # geoms of another file
+    )
+
+
+# ---- the robot ------------------------------------------------------------------------------------------------------
+
+
+def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
+    """Remove the file's actuators. Return joint -> highest torque [N m], of those that state one."""
+    found: dict[str, float] = {}
+    for actuator in list(spec.actuators):
+        gear = abs(float(actuator.gear[0]))
+        force, control = actuator.forcerange, actuator.ctrlrange
+        if force[1] > force[0]:
+            found[actuator.target] = gear * float(np.abs(force).max())
+        elif actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and control[1] > control[0]:
+            found[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
+        spec.delete(actuator)
+    return found
+
+
+def _find_joints(spec: mujoco.MjSpec, file: Path, contract: Contract) -> None:
+    """Raise UserError unless the file has one floating robot with exactly the joints of the contract."""
+    names = [joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    for name in contract.joints:
+        if name not in names:
+            raise UserError(f"--scene: {unknown('joint', name, names, file.name)}")
+    if others := [name or "one without a name" for name in names if name not in contract.joints]:
+        raise UserError(f"--scene: {file.name} has joints that the policy does not move: {', '.join(others)}")
+    free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    root = _root(spec, contract)
+    if [joint.parent.name for joint in free] != [root.name] or root.parent.name != "world":
+        raise UserError(
+            f"--scene: {file.name} must have one free joint, of the robot's root; it has {len(free)}: "
+            f"{', '.join(joint.parent.name or 'of a body without a name' for joint in free) or 'none'}"
+        )
+
+
+def _root(spec: mujoco.MjSpec, contract: Contract) -> mujoco.MjsBody:
+    """The body of the world that carries the joints."""
+    body = spec.joint(contract.joints[0]).parent
+    while body.parent.name != "world":
+        body = body.parent
+    return body
+
+
+def _make_ready(spec: mujoco.MjSpec, contract: Contract, limits: dict[str, float]) -> None:
+    """Servos by the contract's gains, a ground where there is none, groups as a height scan wants them."""
+    for key in list(spec.keys):
+        spec.delete(key)
+    spec.nkey = 0
+    for i, name in enumerate(contract.joints):
+        stiffness, damping = float(contract.stiffness[i]), float(contract.damping[i])
+        limit = {"forcelimited": True, "forcerange": [-limits[name], limits[name]]} if name in limits else {}
+        spec.add_actuator(
+            name=name,
+            target=name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            dyntype=mujoco.mjtDyn.mjDYN_NONE,
+            gainprm=[stiffness, *[0.0] * 9],
+            biasprm=[0.0, -stiffness, -damping, *[0.0] * 7],
+            gear=[1.0, *[0.0] * 5],
+            ctrllimited=False,
+            **limit,
+        )
+    world = [geom for geom in spec.worldbody.geoms if geom.contype or geom.conaffinity]
+    if not world:
+        plane = mujoco.mjtGeom.mjGEOM_PLANE
+        spec.worldbody.add_geom(name="floor_of_deploy", type=plane, size=[0.0, 0.0, 0.05], contype=1, conaffinity=1)
+    for geom in spec.geoms:  # a height scan sees group 0 alone
+        ground = geom.parent.name == "world"
+        geom.group = 0 if ground else geom.group or 1
+
+
+def _find_imu(spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract) -> str:
+    """The IMU's site: the file's of that name, else one at its place on the body of the same name, else on the root."""
+    if spec.site(contract.imu) is not None:
+        return contract.imu
+    site = own.site(contract.imu)
+    body = spec.body(own.body(int(site.bodyid[0])).name) or _root(spec, contract)
+    body.add_site(name=contract.imu, pos=site.pos, quat=site.quat, group=3)
+    return contract.imu
+
+
+# ---- start pose, feet, sensors --------------------------------------------------------------------------------------
+
+
+def _stand(spec: mujoco.MjSpec, contract: Contract, lowest: Lowest) -> None:
+    """Add the keyframe: upright, in the default pose, the lowest point at the height 0."""
+    model = spec.compile()
+    data = _posed(model, contract)
+    touching = np.flatnonzero((model.geom_conaffinity | model.geom_contype > 0) & (model.geom_bodyid > 0)).tolist()
+    data.qpos[2] -= min((lowest(model, data, geom) for geom in touching), default=0.0)
+    spec.add_key(name=HOME, qpos=data.qpos.tolist(), ctrl=contract.default_pose.tolist())
+
+
+def _posed(model: mujoco.MjModel, contract: Contract) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:7] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]
+    data.qpos[[model.joint(name).qposadr[0] for name in contract.joints]] = contract.default_pose
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _find_feet(
+    spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract, lowest: Lowest
+) -> dict[str, tuple[str, ...]]:
+    """Foot -> its contact sensors. A foot is what reaches lowest of all that the same joint moves as in the export."""
+    model, feet = spec.compile(), {}
+    data = _posed(model, contract)
+    for foot, sensors in contract.feet.items():
+        geom = int(own.sensor(sensors[0]).objid[0])
+        moved = int(own.body_weldid[own.geom_bodyid[geom]])
+        joint = own.joint(int(own.body_jntadr[moved])).name
+        body = int(model.joint(joint).bodyid[0])
+        colliding = (model.geom_contype | model.geom_conaffinity) > 0
+        geoms = np.flatnonzero((model.body_weldid[model.geom_bodyid] == model.body_weldid[body]) & colliding).tolist()
+        if not geoms:
+            raise UserError(f"--scene: nothing that '{joint}' moves can touch the ground, so there is no foot {foot}")
+        heights = [lowest(model, data, each) for each in geoms]
+        low = [each for each, height in zip(geoms, heights, strict=True) if height < min(heights) + _LOW]
+        feet[foot] = tuple(_feel(spec, each, f"contact/{foot}/{i}") for i, each in enumerate(low))
+    return feet
+
+
+def _feel(spec: mujoco.MjSpec, geom: int, name: str) -> str:
+    """Add a sensor of the contacts of a geom with the ground, and return its name."""
+    felt: Any = spec.geoms[geom]
+    felt.name = felt.name or name
+    spec.add_sensor(
+        name=name,
+        type=_SENSOR.mjSENS_CONTACT,
+        objtype=_OBJECT.mjOBJ_GEOM,
+        objname=felt.name,
+        reftype=_OBJECT.mjOBJ_BODY,
+        refname="world",
+        intprm=[1, 0, 1],  # the number of contacts found
+    )
+    return name
+
+
+def _add_sensors(spec: mujoco.MjSpec, contract: Contract, imu: str) -> dict[str, tuple[str, ...]]:
+    """Quantity -> sensors, added under names of their own."""
+    site, joint, found = _OBJECT.mjOBJ_SITE, _OBJECT.mjOBJ_JOINT, {}
+
+    def add(quantity: str, kind: Any, of: Any, *names: str, **more: Any) -> None:
+        found[quantity] = tuple(f"deploy/{quantity}/{name}" for name in names)
+        for full, name in zip(found[quantity], names, strict=True):
+            spec.add_sensor(name=full, type=kind, **{"objtype": of, "objname": name, **more})
+
+    add("lin_vel", _SENSOR.mjSENS_VELOCIMETER, site, imu)
+    add("ang_vel", _SENSOR.mjSENS_GYRO, site, imu)
+    up = {"objtype": _OBJECT.mjOBJ_BODY, "objname": "world", "reftype": site, "refname": imu}
+    add("up", _SENSOR.mjSENS_FRAMEZAXIS, site, imu, **up)
+    add("acceleration", _SENSOR.mjSENS_ACCELEROMETER, site, imu)
+    add("joint_pos", _SENSOR.mjSENS_JOINTPOS, joint, *contract.joints)
+    add("joint_vel", _SENSOR.mjSENS_JOINTVEL, joint, *contract.joints)
+    add("joint_torque", _SENSOR.mjSENS_ACTUATORFRC, _OBJECT.mjOBJ_ACTUATOR, *contract.joints)
+    return found

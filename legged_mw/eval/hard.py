@@ -1,0 +1,355 @@
+"""The hard exam: conditions that a robot brings, how the walk looks, and the marks of "ready for a robot". Numpy alone.
+
+``legged_mw.deploy.hard_exam`` runs it on an export. Shapes: T physics steps, P control steps, D joints, F feet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.eval.figures import stride_frequency
+from legged_mw.eval.walking import AXES, LOADS, ExamRules, Figure, Velocity
+
+Array = NDArray[Any]
+
+# ---- the conditions -------------------------------------------------------------------------------------------------
+
+
+SECONDS, SETTLING = 6.0, 2.0  # [s] of a command, and at its start without a measure
+# Push k of the 32 comes at PUSH_AT + k control steps; survived if the robot stands at the end, 3 s later at 50 Hz.
+PUSH_AT, PUSH_DIRECTIONS = 2.3, 32
+PUSH_BIPED, PUSH_OTHERS = 2.0, 3.0  # [m/s] jump of the base's horizontal velocity
+LOAD = 0.175  # share of the robot's mass, where no load is known that published policies carried
+# Half widths of uniform noise on what the policy measures [ours: about twice a good sensor's]
+NOISE = {"ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "joint_vel": 1.5}
+
+
+class Condition(NamedTuple):
+    """What is unlike the nominal robot."""
+
+    name: str
+    delay: float = 0.0  # [ms] from the measurement to the servos' target
+    gains: float = 1.0  # factor on stiffness and damping; on the torque of motors without gains
+    loaded: bool = False  # the load at the trunk
+    friction: float | None = None  # of all contacts; None: the scene's
+    noisy: bool = False  # NOISE
+
+
+ALL = "all"
+CONDITIONS = (
+    Condition("none"),
+    Condition("delay 10 ms", delay=10.0),
+    Condition("delay 20 ms", delay=20.0),
+    Condition("gains x 0.8", gains=0.8),
+    Condition("gains x 1.2", gains=1.2),
+    Condition("load", loaded=True),
+    Condition("friction 0.3", friction=0.3),
+    Condition("noise", noisy=True),
+    Condition(ALL, delay=10.0, gains=0.9, loaded=True, friction=0.5, noisy=True),
+)
+
+
+def commands(rules: ExamRules) -> list[Velocity]:
+    """The twelve commands; the first is standing. A side that the range does not have is left out."""
+    (x0, x1), (y0, y1), (w0, w1) = rules.ranges
+    alone = [(x1 / 2, 0.0, 0.0), (x1, 0.0, 0.0), (x0, 0.0, 0.0)]
+    alone += [(0.0, y, 0.0) for y in (y1, y0)] + [(0.0, 0.0, w) for w in (w1, w0)]
+    corners = [(2 * x1 / 3, y / 2, w / 2) for y in (y1, y0) for w in (w1, w0)]
+    every = [(0.0, 0.0, 0.0), *alone, *corners]
+    return list(dict.fromkeys((round(vx, 4), round(vy, 4), round(yaw, 4)) for vx, vy, yaw in every))
+
+
+def half_speed(rules: ExamRules) -> float:
+    """vx [m/s] of a robot that is pushed and looked at: half of the highest."""
+    return round(rules.ranges[0][1] / 2, 4)
+
+
+def push_speed(feet: int) -> float:
+    """[m/s]"""
+    return PUSH_BIPED if feet == 2 else PUSH_OTHERS
+
+
+def load_of(rules: ExamRules, mass: float) -> float:
+    """The load [kg] for a robot of ``mass`` [kg]: the one that its published policies carried, else LOAD of its mass."""
+    return LOADS.get(rules.peer, round(LOAD * mass, 2))
+
+
+def grade_condition(rules: ExamRules, velocity: Array, position: Array, fell_at: Array, dt: float) -> dict[str, Any]:
+    """Falls, errors, drift and pushes survived under one condition.
+
+    The worlds are those of ``commands``, then the pushes. ``velocity`` (P, N, 3) [m/s, m/s, rad/s], ``position``
+    (P, N, 2) [m], before each of P control steps of ``dt`` [s]. ``fell_at`` (N,): control step of the first fall, or
+    inf. A command at which the robot falls has the error of standing still.
+    """
+    asked = np.array(commands(rules))
+    count, settled = len(asked), round(SETTLING / dt)
+    stood = np.isinf(fell_at)
+    error = np.abs(velocity[settled:, :count] - asked).mean(axis=0, dtype=float)
+    error = np.where(stood[:count, None], error, np.abs(asked))
+    drift = float(np.linalg.norm(position[-1, 0] - position[settled, 0]))
+    return {
+        "falls": int((~stood[:count]).sum()),
+        "error": [round(float(value), 5) for value in error.mean(axis=0)],
+        "drift": round(drift, 5) if stood[0] else None,
+        "pushes": round(float(stood[count:].mean()), 4),
+    }
+
+
+# ---- how it looks ---------------------------------------------------------------------------------------------------
+
+
+AT_LIMIT = 0.02  # of a joint's range: nearer to its ends, or beyond them, counts as at the limit
+DOWN = 0.02  # body weights: a foot with less force on it is in the air [ours: 0.3 kg of a Go2]
+SHORT = 0.04  # [s] a shorter time in the air is chatter of the contact
+TOUCHDOWN = 0.06  # [s] after a touchdown, in which the foot hits the ground
+FAST = 10.0  # [Hz] a motor follows slower targets; faster ones are noise and heat
+
+
+class Walk(NamedTuple):
+    """A robot that walks straight ahead, sampled at each physics step, without the settling time."""
+
+    dt: float  # [s] physics step
+    period: float  # [s] control step
+    weight: float  # [N]
+    tilt: Array  # (T, 2) [rad] the trunk's roll and pitch
+    sideways: Array  # (T, F) [m] place of each foot, to the left of the root
+    height: Array  # (T, F) [m] of each foot's lowest point above the ground
+    sole: Array | None  # (T, F) [rad] tilt of each sole; None: point feet
+    force: Array  # (T, F) [N] on each foot
+    angle: Array  # (T, D) [rad]
+    target: Array  # (P, D) [rad] the policy's own, before any clamp
+    torque: Array  # (T, D) [N m]
+    speed: Array  # (T, D) [rad/s]
+    low: Array  # (D,) [rad] ends of the joints' ranges; infinite without a range
+    high: Array  # (D,) [rad]
+    limit: Array  # (D,) [N m] torque limits; infinite where unknown
+    joints: Sequence[str]
+    clock: float | None  # [1/s] strides of the policy's gait clock
+
+
+def looks(walk: Walk) -> dict[str, Any]:
+    """All figures of the walk: angles in degrees, lengths in m, forces in body weights."""
+    down = on_ground(walk.force / walk.weight, walk.dt)
+    every = round(walk.period / walk.dt)
+    left = walk.sideways.mean(axis=0) > 0.0
+    duty = down.mean(axis=0)
+    tilt = np.degrees(walk.tilt)
+    hit, swing = hits(walk.force / walk.weight, down, walk.dt), clearances(walk.height, down)
+    angle, target = (_worst(at_limit(values, walk), walk.joints) for values in (walk.angle, walk.target))
+    rms = np.sqrt((walk.torque**2).mean(axis=0, dtype=float))
+    soles = np.degrees(walk.sole) if walk.sole is not None else None
+    return {
+        "roll": _sway(tilt[:, 0]),
+        "pitch": _sway(tilt[:, 1]),
+        "feet_apart": _number(walk.sideways[:, left].mean() - walk.sideways[:, ~left].mean()) if _both(left) else None,
+        "sole_tilt": _worst_mean(soles, down),
+        "strides": _number(stride_frequency(down[::every], walk.period)),
+        "clock": walk.clock,
+        "clearance": _number(np.mean(swing)) if swing else None,
+        "duty": [_number(share) for share in duty],
+        "duty_left_right": _number(duty[left].mean() - duty[~left].mean()) if _both(left) else None,
+        "all_down": _number(down.all(axis=1).mean()),
+        "angle_at_limit": angle,
+        "target_at_limit": target,
+        "hit": {"mean": _number(np.mean(hit)), "most": _number(max(hit))} if hit else None,
+        "torque_over_limit": _worst(rms / walk.limit, walk.joints) if np.isfinite(walk.limit).any() else None,
+        "torque_by_joint": dict(zip(walk.joints, [_number(each) for each in rms / walk.limit], strict=True)),
+        "target_step": _number(np.abs(np.diff(walk.target, axis=0)).mean()),
+        "fast_share": fast_share(walk.target, walk.period),
+        "peak_power": _number(np.abs(walk.torque * walk.speed).sum(axis=1).max()),
+    }
+
+
+def on_ground(force: Array, dt: float) -> NDArray[np.bool_]:
+    """(T, F) True for a foot that carries more than DOWN; ``force`` (T, F) in body weights. Chatter is filled in."""
+    down = force > DOWN
+    for foot in range(down.shape[1]):
+        for start, end in spans(~down[:, foot]):
+            if start > 0 and end < len(down) and (end - start) * dt < SHORT - 1e-9:
+                down[start:end, foot] = True
+    return down
+
+
+def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First index, and index after the last, of each run of True in ``mask`` (T,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def hits(force: Array, down: NDArray[np.bool_], dt: float) -> list[float]:
+    """The highest force in TOUCHDOWN after each touchdown of each foot; all of it must be in the record."""
+    length, found = round(TOUCHDOWN / dt), []
+    for foot in range(force.shape[1]):
+        starts = [start for start, _ in spans(down[:, foot]) if 0 < start <= len(force) - length]
+        found += [float(force[start : start + length, foot].max()) for start in starts]
+    return found
+
+
+def clearances(height: Array, down: NDArray[np.bool_]) -> list[float]:
+    """The highest height [m] of each foot in each whole swing, above its mean height on the ground."""
+    found = []
+    for foot in range(height.shape[1]):
+        if not down[:, foot].any():
+            continue
+        ground = float(height[down[:, foot], foot].mean())
+        swings = [(start, end) for start, end in spans(~down[:, foot]) if start > 0 and end < len(height)]
+        found += [float(height[start:end, foot].max()) - ground for start, end in swings]
+    return found
+
+
+def at_limit(values: Array, walk: Walk) -> Array:
+    """(D,) Share of time that ``values`` (T, D) are within AT_LIMIT of the ends of the range, or beyond them."""
+    known = np.isfinite(walk.low) & np.isfinite(walk.high)
+    margin = np.where(known, AT_LIMIT * (np.where(known, walk.high, 0.0) - np.where(known, walk.low, 0.0)), 0.0)
+    return ((values <= walk.low + margin) | (values >= walk.high - margin)).mean(axis=0)
+
+
+def fast_share(target: Array, period: float) -> float | None:
+    """Share of the power of ``target`` (P, D) above FAST, its mean left out, under a Hann window; None if it rests."""
+    moving = (target - target.mean(axis=0)) * np.hanning(len(target))[:, None]
+    power = np.abs(np.fft.rfft(moving, axis=0)) ** 2
+    above = np.fft.rfftfreq(len(target), period) > FAST
+    total = power.sum()
+    return _number(power[above].sum() / total) if total > 1e-12 else None
+
+
+def _sway(angle: Array) -> dict[str, float | None]:
+    """Mean, and half of the way from the lowest to the highest."""
+    return {"mean": _number(angle.mean()), "amplitude": _number((angle.max() - angle.min()) / 2)}
+
+
+def _worst(share: Array, joints: Sequence[str]) -> dict[str, Any]:
+    worst = int(np.argmax(share))
+    return {"worst": _number(share[worst]), "joint": joints[worst] if share[worst] > 0.0 else ""}
+
+
+def _worst_mean(angle: Array | None, down: NDArray[np.bool_]) -> float | None:
+    """Of the feet's mean angles while on the ground the largest; None without soles, or if no foot is ever down."""
+    if angle is None or not down.any():
+        return None
+    return _number(max(angle[down[:, foot], foot].mean() for foot in range(angle.shape[1]) if down[:, foot].any()))
+
+
+def _both(left: NDArray[np.bool_]) -> bool:
+    return bool(left.any() and not left.all())
+
+
+def _number(value: Any) -> float | None:
+    return round(float(value), 5) if math.isfinite(value) else None
+
+
+# ---- the marks ------------------------------------------------------------------------------------------------------
+
+
+PUSHES, LIMITS, TORQUE, TRUNK, SOLES = 0.9, 0.01, 0.4, 5.0, 3.0  # at least; at most: share, share, share, [deg], [deg]
+
+
+def trunk(found: Mapping[str, Any]) -> float:
+    """[deg] The largest tilt of the trunk: of roll and pitch, the mean and the amplitude together."""
+    return max(abs(found[axis]["mean"]) + found[axis]["amplitude"] for axis in ("roll", "pitch"))
+
+
+def finish(
+    rules: ExamRules,
+    walks: bool,
+    conditions: Mapping[str, Any],
+    found: Mapping[str, Any] | None,
+    feet: int,
+    load: float,
+) -> dict[str, Any]:
+    """The result of the hard exam. ``found``: of ``looks``; None if the robot fell while it was looked at."""
+    result: dict[str, Any] = {
+        "ready": False,
+        "misses": [],
+        "walks": walks,
+        "conditions": dict(conditions),
+        "looks": dict(found) if found else None,
+        "commands": [list(command) for command in commands(rules)],
+        "vx": half_speed(rules),
+        "push_speed": push_speed(feet),
+        "load": load,
+    }
+    result["misses"] = misses(result)
+    return {**result, "ready": not result["misses"]}
+
+
+def misses(result: Mapping[str, Any]) -> list[str]:
+    """What keeps the policy from a robot, in words; empty if it is ready."""
+    conditions, found = result["conditions"], result["looks"]
+    said = [] if result["walks"] else ["does not walk by the walking exam"]
+    fallen = [name for name, each in conditions.items() if each["falls"]]
+    said += [f"falls under {', '.join(fallen)}"] if fallen else []
+    survived = conditions[ALL]["pushes"]
+    said += [f"survives {survived:.0%} of the pushes under all, not {PUSHES:.0%}"] if survived < PUSHES else []
+    if not found:
+        return [*said, "falls while it is looked at"]
+    for name in ("angle", "target"):
+        share, joint = found[f"{name}_at_limit"]["worst"], found[f"{name}_at_limit"]["joint"]
+        said += [f"{name} of {joint} at its limit {share:.0%} of the time"] if share > LIMITS else []
+    load = found["torque_over_limit"]
+    if load and load["worst"] > TORQUE:
+        said.append(f"torque of {load['joint']} is {load['worst']:.2f} of its limit (RMS), not {TORQUE}")
+    said += [f"trunk tilts by {trunk(found):.1f} degrees, not {TRUNK:g}"] if trunk(found) > TRUNK else []
+    tilt = found["sole_tilt"]
+    return said + ([f"soles tilt by {tilt:.1f} degrees, not {SOLES:g}"] if tilt is not None and tilt > SOLES else [])
+
+
+def figures(result: Mapping[str, Any]) -> list[Figure]:
+    """The rows of how it looks, with the marks."""
+    found = result["looks"]
+    if not found:
+        return []
+    said = {key: (found[key] or {}) for key in ("hit", "torque_over_limit")}
+    rows = [
+        Figure("trunk's largest tilt [deg]", trunk(found), 1, TRUNK),
+        Figure("  roll, mean", found["roll"]["mean"], 1),
+        Figure("  roll, amplitude", found["roll"]["amplitude"], 1),
+        Figure("  pitch, mean", found["pitch"]["mean"], 1),
+        Figure("  pitch, amplitude", found["pitch"]["amplitude"], 1),
+        Figure("feet apart sideways [m]", found["feet_apart"], 3),
+    ]
+    if found["sole_tilt"] is not None:
+        rows.append(Figure("soles' tilt at stance [deg]", found["sole_tilt"], 1, SOLES))
+    rows.append(Figure("strides of a foot [1/s]", found["strides"], 2))
+    if found["clock"] is not None:
+        rows.append(Figure("  its gait clock", found["clock"], 2))
+    return [
+        *rows,
+        Figure("swing clearance [m]", found["clearance"], 3, without="none"),
+        Figure("duty, left minus right", found["duty_left_right"], 3, without="none"),
+        Figure("share of all feet down", found["all_down"], 2),
+        Figure("angle at a limit, worst joint", found["angle_at_limit"]["worst"], 3, LIMITS),
+        Figure("target at a limit, worst joint", found["target_at_limit"]["worst"], 3, LIMITS),
+        Figure("hit at touchdown [weights]", said["hit"].get("mean"), 2, without="none"),
+        Figure("  the hardest", said["hit"].get("most"), 2, without="none"),
+        Figure(
+            "torque RMS / limit, worst joint", said["torque_over_limit"].get("worst"), 2, TORQUE, without="no limit"
+        ),
+        Figure("target's mean step [rad]", found["target_step"], 3),
+        Figure("target's power above 10 Hz", found["fast_share"], 3, without="none"),
+        Figure("peak power [W]", found["peak_power"], 0),
+    ]
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """The result as text."""
+    names = ", ".join(name.removesuffix(" rate") for name, _ in AXES)
+    pushed = f"pushes of {result['push_speed']:g} m/s"
+    lines = [f"hard exam: {len(result['commands'])} commands and {PUSH_DIRECTIONS} pushes under each condition"]
+    lines.append(f"{'':<16}{'falls':>6}{f'error {names}':>24}{'drift [m]':>11}{pushed:>20}")
+    for name, each in result["conditions"].items():
+        error = ", ".join(f"{value:.3f}" for value in each["error"])
+        drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
+        title = f"{name} {result['load']:g} kg" if name == "load" else name
+        lines.append(f"{title:<16}{each['falls']:>6}{error:>24}{drift:>11}{each['pushes']:>20.2f}")
+    at = f"walking at {result['vx']:g} m/s"
+    lines += ["", f"{at:<34}{'this policy':>12}{'ready at':>10}"]
+    for row in figures(result):
+        lines.append(f"{row.name:<34}{row.text(row.value):>12}{row.mark_text():>10}".rstrip())
+    ready = "yes" if result["ready"] else f"no: {'; '.join(result['misses'])}"
+    return "\n".join([*lines, f"ready for a robot: {ready}"])

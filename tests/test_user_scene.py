@@ -1,0 +1,190 @@
+"""deploy --scene: an export in an MJCF of another's, with other motors, other names and no sensors."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+
+from legged_mw import ROOT
+from legged_mw.deploy import __main__ as program
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.exam import contract_rules, run_exam
+from legged_mw.deploy.hard_exam import apply_conditions, look
+from legged_mw.deploy.simulated import lowest_point
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.deploy.user_scene import fit
+from legged_mw.eval import hard, walking
+from legged_mw.utils.errors import UserError
+
+GO2 = ROOT / "resources/policies/go2_flat"
+NAMES = [condition.name for condition in hard.CONDITIONS]
+Change = Callable[[ElementTree.Element], None]
+
+
+def vendors(folder: Path, change: Change = lambda _: None) -> Path:
+    """A Go2 as a vendor's: torque motors by other names, joints in another order, its own frictions, no sensor, no key."""
+    root = ElementTree.parse(GO2 / "scene.xml").getroot()
+    for name in ("actuator", "sensor", "keyframe", "size"):
+        for element in root.findall(name):
+            root.remove(element)
+    root.find("option").attrib = {"timestep": "0.002"}  # type: ignore[union-attr]
+    for joint in root.iter("joint"):
+        if "damping" in joint.attrib:
+            joint.attrib |= {"damping": "0.1"}
+            joint.attrib.pop("actuatorfrcrange", None)
+    base = next(body for body in root.iter("body") if body.get("name") == "base")
+    for site in [site for site in base if site.tag == "site"]:
+        base.remove(site)
+    legs = [body for body in base if body.tag == "body"]
+    for leg in legs:
+        base.remove(leg)
+    base.extend(legs[2:] + legs[:2])
+    motors = ElementTree.SubElement(root, "actuator")
+    for joint in read_contract(GO2).joints:
+        high = "45" if "calf" in joint else "23"
+        ElementTree.SubElement(
+            motors,
+            "motor",
+            {"name": f"m_{joint}", "joint": joint, "ctrlrange": f"-{high} {high}", "ctrllimited": "true"},
+        )
+    change(root)
+    file = folder / "vendor.xml"
+    ElementTree.ElementTree(root).write(file)
+    return file
+
+
+def test_it_walks_there_as_at_home(tmp_path: Path) -> None:
+    stage = DeployStage(GO2, 4, scene_file=vendors(tmp_path))
+    model, contract = stage.fleet.model, stage.contract
+    assert contract.timestep == 0.002 and contract.decimation == 10 and contract.period == 0.02
+    servo = model.actuator("RL_calf_joint").id
+    gain = contract.stiffness[contract.joints.index("RL_calf_joint")]
+    assert model.actuator_gainprm[servo, 0] == gain and model.actuator_biasprm[servo, 1] == -gain
+    assert model.actuator_forcerange[servo].tolist() == [-45.0, 45.0] and model.nu == 12
+    assert model.actuator_biasprm[servo, 2] == -contract.damping[0] and not stage.fleet.damps_by_joint
+    assert model.dof_damping[stage.fleet._dofs].ravel() == pytest.approx(0.1)
+    assert all(len(sensors) == 1 for sensors in contract.feet.values())
+    command = np.tile([1.0, 0.0, 0.0], (4, 1))
+    speeds = []
+    for step in range(150):
+        stage.step(command)
+        assert not stage.fell().any()
+        speeds += [stage.velocity()[:, 0]] if step >= 75 else []
+    assert np.mean(speeds) == pytest.approx(1.0, abs=0.06)
+
+
+def test_its_conditions_and_its_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, contract = vendors(tmp_path), read_contract(GO2)
+    stage = DeployStage(GO2, len(NAMES), scene_file=file)
+    apply_conditions(stage, np.arange(len(NAMES)), 3.0)
+    soft, servo = stage.fleet._batch.get_model(NAMES.index("gains x 0.8")), stage.fleet._actuators[0]
+    assert soft.actuator_biasprm[servo, 1:3] == pytest.approx(
+        -0.8 * np.array([contract.stiffness[0], contract.damping[0]])
+    )
+    assert soft.dof_damping[stage.fleet._dofs].ravel() == pytest.approx(0.1)  # the joints' own
+    monkeypatch.setattr("legged_mw.deploy.hard_exam.LOOK_SECONDS", 4.0)
+    walk, _ = look(GO2, contract, contract_rules(contract, common=True), scene=file)
+    assert walk and walk.limit.tolist() == [23.0, 23.0, 45.0] * 4
+    found = hard.looks(walk)
+    assert walk.force.sum(axis=1).mean() / walk.weight == pytest.approx(1.0, abs=0.06)
+    assert 2.0 < found["strides"] < 3.0 and found["sole_tilt"] is None
+
+
+def test_a_scene_without_a_ground_gets_one(tmp_path: Path) -> None:
+    def bare(root: ElementTree.Element) -> None:
+        for world in root.findall("worldbody"):
+            for geom in world.findall("geom"):
+                world.remove(geom)
+
+    spec, _ = fit(vendors(tmp_path, bare), GO2, read_contract(GO2), lowest_point)
+    model = spec.compile()
+    assert [model.geom(i).type[0] for i in np.flatnonzero(model.geom_bodyid == 0)] == [mujoco.mjtGeom.mjGEOM_PLANE]
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_kinematics(model, data)
+    feet = [i for i in range(model.ngeom) if model.geom_conaffinity[i] and model.geom_bodyid[i]]
+    assert min(lowest_point(model, data, geom) for geom in feet) == pytest.approx(0.0, abs=1e-6)
+
+
+def renamed(root: ElementTree.Element) -> None:
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            element.set(key, value.replace("FL_calf_joint", "FL_knee_joint"))
+
+
+def with_a_tail(root: ElementTree.Element) -> None:
+    base = next(body for body in root.iter("body") if body.get("name") == "base")
+    tail = ElementTree.SubElement(base, "body", {"name": "tail"})
+    ElementTree.SubElement(tail, "joint", {"name": "tail_joint"})
+    ElementTree.SubElement(tail, "geom", {"size": "0.02"})
+
+
+def with_a_ball(root: ElementTree.Element) -> None:
+    ball = ElementTree.SubElement(root.findall("worldbody")[0], "body", {"name": "ball", "pos": "2 0 1"})
+    ElementTree.SubElement(ball, "freejoint", {})
+    ElementTree.SubElement(ball, "geom", {"size": "0.1"})
+
+
+def with_time(step: str) -> Change:
+    return lambda root: root.find("option").set("timestep", step)  # type: ignore[union-attr]
+
+
+def with_include(name: str) -> Change:
+    def change(root: ElementTree.Element) -> None:
+        ElementTree.SubElement(root, "include", {"file": name})
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (renamed, ["no joint 'FL_calf_joint'", "FL_knee_joint"]),
+        (with_a_tail, ["does not move", "tail_joint"]),
+        (with_a_ball, ["one free joint", "ball"]),
+        (with_time("0.003"), ["time step of 0.003 s", "0.02 s"]),
+        (with_time("0.05"), ["time step of 0.05 s"]),
+        (with_include("../secret.xml"), ["outside of its own folder"]),
+        (with_include("/etc/passwd"), ["outside of its own folder"]),
+        (lambda root: root.iter("geom").__next__().set("size", "nan"), ["not a number"]),
+    ],
+)
+def test_a_scene_that_does_not_fit(change: Change, words: list[str], tmp_path: Path) -> None:
+    with pytest.raises(UserError) as caught:
+        fit(vendors(tmp_path, change), GO2, read_contract(GO2), lowest_point)
+    line = str(caught.value)
+    assert line.startswith("--scene: ") and "\n" not in line and all(word in line for word in words), line
+
+
+@pytest.mark.parametrize("text", ["", "no xml", "<robot name='a'/>", "<!DOCTYPE a><mujoco/>", "<mujoco/>"])
+def test_what_is_no_scene(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.xml").write_text(text)
+    for file in (tmp_path / "a.xml", tmp_path, tmp_path / "none.xml"):
+        with pytest.raises(UserError):
+            fit(file, GO2, read_contract(GO2), lowest_point)
+    os.mkfifo(tmp_path / "pipe.xml")
+    with pytest.raises(UserError):
+        fit(tmp_path / "pipe.xml", GO2, read_contract(GO2), lowest_point)
+
+
+def test_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(walking, "EXAM_SECONDS", 2.6)
+    monkeypatch.setattr(walking, "PUSH_AT", 1.0)
+    monkeypatch.setattr(walking, "PUSH_UNTIL", 2.2)
+    monkeypatch.chdir(tmp_path)
+    vendors(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["deploy", "go2_flat", "--scene", "vendor.xml", "--eval", "--no_hard"])
+    program.main()
+    saved = json.loads((tmp_path / "logs/go2_flat/shipped/exam_vendor.json").read_text())
+    assert saved["scene"] == "vendor.xml" and saved["falls"] == 0 and saved["pushes"]["2"] > 0.8
+    assert saved["error"] != run_exam(GO2)["error"] and "falls in 22 commands" in capsys.readouterr().out
