@@ -51,6 +51,10 @@ def env() -> LeggedRobot:
 def test_the_table_is_the_ranges_in_order() -> None:
     assert command_table(HeightCfg()) == TABLE
     assert command_table(Go1FlatCfg()) == TABLE[:3], "a heading is no command"
+    for end in (0.2, 0.32):  # the ends of the range are in it
+        at_end = HeightCfg()
+        at_end.commands.default = {"base_height": end}
+        assert command_table(at_end)[3].default == end
     assert with_units(TABLE) == "vx [m/s], vy [m/s], yaw rate [rad/s], base height [m]"
 
 

@@ -13,14 +13,27 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from drivers import Watched
 
 from legged_mw import ROOT
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.controller import Controller
+from legged_mw.deploy.inputs import RobotRemote
+from legged_mw.deploy.log import Log
+from legged_mw.deploy.robot import Health, Remote
+from legged_mw.deploy.runner import run as walk
+from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.states import States
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.exams import require_exam
+from legged_mw.export import exporter
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.rl.runner import Runner, make_runner
+from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
 
 PACKAGE = str(ROOT / "legged_mw")
+SHIPPED = ROOT / "resources/policies/go1_flat"
 TITLE = "## What to open"
 
 
@@ -126,6 +139,62 @@ def an_exam() -> Callable[[], object]:
     return lambda: exam.table(exam.examine(env, lambda obs: actions[: len(obs)])[0])
 
 
+def unseen(call: Callable[..., Any]) -> Callable[..., Any]:
+    """``call``, in which `touched` does not look."""
+
+    def inside(*args: Any, **more: Any) -> Any:
+        look = sys.getprofile()
+        sys.setprofile(None)
+        try:
+            return call(*args, **more)
+        finally:
+            sys.setprofile(look)
+
+    return inside
+
+
+def an_export() -> Callable[[], object]:
+    """Of a published policy, whose network stands for what torch would write of it again."""
+    task, folder = load_task("go1_flat"), Path(tempfile.mkdtemp())
+    update_from_run(task, load_yaml(SHIPPED / "config.yaml"), "config.yaml")
+    env = exporter._small_env(task)
+    env.step = unseen(env.step)  # type: ignore[method-assign]
+
+    def write(model: object, args: object, path: Path, **more: object) -> None:
+        shutil.copy(SHIPPED / "policy.onnx", path)
+
+    def run() -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(exporter, "_small_env", lambda task: env)
+            patch.setattr(torch.onnx, "export", write)
+            exporter.export(task, SHIPPED / "policy.onnx", folder)
+        shutil.rmtree(folder)
+
+    return run
+
+
+def a_robot() -> Callable[[], object]:
+    """It stands up, walks, and is damped, by its remote; logged. The robot is MuJoCo's."""
+    folder, presses = Path(tempfile.mkdtemp()), {5: "start", 150: "A", 160: "select"}
+
+    def health(step: int) -> Health:
+        return Health(age_s=0.0, remote=Remote(frozenset({presses[step]} if step in presses else ())))
+
+    def drive() -> None:
+        contract = read_contract(SHIPPED)
+        robot, controller = Watched(SHIPPED, contract), Controller(SHIPPED, contract)
+        robot.health_at = health
+        said, still = list[str](), contract.held([0.0, 0.0, 0.0])
+        states = States(controller, [RobotRemote(contract.commands)], lambda now: still, said.append)
+        safety = Safety(contract, Limits.of(SHIPPED, contract, robot.limits))
+        log = Log(folder / "run.lmwlog", contract, SHIPPED, "simulated", said.append)
+        done = walk(robot, controller, lambda now: still, 3.4, live=False, safety=safety, states=states, log=log)
+        assert {"limp", "write", "damp"} == {*robot.done} and not done.trips
+        shutil.rmtree(folder)
+
+    return drive
+
+
 # concept -> how it is run, most files to read, most files in which code runs
 BUDGETS: dict[str, tuple[Callable[[], Callable[[], object]], int, int]] = {
     "one step of walking": (a_step, 8, 15),
@@ -135,6 +204,8 @@ BUDGETS: dict[str, tuple[Callable[[], Callable[[], object]], int, int]] = {
     "an iteration of PPO, without its steps": (an_iteration, 4, 13),
     "a checkpoint saved and resumed": (a_checkpoint, 3, 12),
     "the walking exam, without its steps": (an_exam, 6, 19),
+    "an export, without the steps of its environment": (an_export, 6, 32),
+    "a policy on a robot": (a_robot, 9, 15),
 }
 
 

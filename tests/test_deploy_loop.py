@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from legged_mw.deploy import loop as loop_module
 from legged_mw.deploy.loop import Loop, Spread
 
 
@@ -83,6 +84,18 @@ def test_a_loop_that_is_not_live_never_waits(monkeypatch: pytest.MonkeyPatch) ->
     with Loop(0.02, live=False) as loop:
         assert gc.isenabled() and [round(now, 6) for now in loop.ticks(0.1)] == [0.0, 0.02, 0.04, 0.06, 0.08]
     assert clock.now == 100.0 and loop.timing().jitter == Spread(0.0, 0.0, 0.0)
+
+
+def test_spread_of_the_last_times_and_the_worst_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the last three alone are median and 99th percentile; the worst is of all that came."""
+    monkeypatch.setattr(loop_module, "KEPT", 3)
+    samples = loop_module._Samples()
+    assert samples.spread() == Spread(0.0, 0.0, 0.0)
+    samples.add(7.0)
+    assert samples.spread() == Spread(7.0, 7.0, 7.0)
+    for value in (9.0, 1.0, 2.0, 3.0):
+        samples.add(value)
+    assert samples.spread() == pytest.approx((2.0, 2.98, 9.0))
 
 
 def test_garbage_is_collected_between_steps_alone() -> None:

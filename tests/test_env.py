@@ -21,6 +21,7 @@ from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.envs.snapshot import put_snapshot, take_snapshot
+from legged_mw.envs.statistics import BOUND, NonFinite, Statistics
 from legged_mw.utils.errors import NotRecordable
 from legged_mw.utils.task import load_task
 
@@ -654,6 +655,27 @@ def test_a_broken_world_is_reset_alone(quiet: LeggedRobot, hurt: Callable[[Legge
             assert torch.isfinite(obs_2[group]).all()
             assert same(obs[group][others], obs_2[group][others])
         assert same(reward[others], reward_2[others]) and same(done[others], done_2[others])
+
+
+def test_statistics_by_hand() -> None:
+    """Means over the two episodes that ended, counts of all worlds, and present values, some divided by their count."""
+    statistics = Statistics(["length"], ["episodes", "fell"], "cpu")
+    ended, counts = torch.tensor([True, False, True]), torch.tensor([[1.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    statistics.add(ended, torch.tensor([[1.0], [math.nan], [4.0]]), counts)
+    live = {"speed": torch.tensor(2.5), "level": torch.tensor([6.0, 3.0]), "unseen": torch.zeros(2)}
+    taken = statistics.take(live).tolist()
+    assert taken == [5.0, 2.0, 1.0, 2.5, 6.0, 3.0, 0.0, 0.0]
+    assert statistics.name(taken) == {"length": 2.5, "episodes": 2.0, "fell": 1.0, "speed": 2.5, "level": 2.0}
+    nothing = statistics.name(statistics.take({}).tolist())
+    assert math.isnan(nothing["length"]) and (nothing["episodes"], nothing["fell"]) == (0.0, 0.0)
+
+
+def test_bad_values_become_zero_and_are_counted_by_column() -> None:
+    values = torch.tensor([[1.0, math.nan], [-BOUND, -math.inf], [1.1 * BOUND, 2.0]])
+    bad = NonFinite(["one", "two"], "cpu")
+    bad.clear(values)
+    assert values.tolist() == [[1.0, 0.0], [-BOUND, 0.0], [0.0, 2.0]]
+    assert bad.take().tolist() == [1.0, 2.0] and bad.take().tolist() == [0.0, 0.0]
 
 
 def test_fast_but_not_too_fast_is_not_broken() -> None:

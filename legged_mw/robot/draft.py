@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -381,7 +382,7 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
         ]
         if body not in soles and same and len(of_body[same[0]]) == len(these):
             soles[body] = [geom for geom, like in zip(these, of_body[same[0]], strict=True) if like in soles[same[0]]]
-    return [_foot(robot, body, soles[body]) for body in sorted(soles)]
+    return _renamed(robot, [_foot(robot, body, soles[body]) for body in sorted(soles)])
 
 
 def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
@@ -411,7 +412,23 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]
     if parts:
         return Foot(parts[-1], names, True)
-    return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
+    owner = robot.physics.body(body).name
+    return Foot(names[0], names, True) if len(names) == 1 else Foot(owner, names, False)
+
+
+def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
+    """Feet whose name is that of a geom, as FL_calf_4, are called by their side: FL_foot, if nothing else is."""
+    new = list[Foot]()
+    for foot in feet:
+        owner = robot.physics.body(int(robot.physics.geom(foot.geoms[0]).bodyid[0])).name
+        side = [part for part in owner.split("_") if part not in (*family(owner).split("_"), "joint")]
+        plain = re.fullmatch(rf"{re.escape(owner)}_\d+", foot.name) and side
+        new.append(Foot("_".join([*side, "foot"]), foot.geoms, False) if plain else foot)
+    taken = {*robot.names.geoms, *robot.names.bodies, *(foot.name for foot in feet)}
+    clash = len({foot.name for foot in new}) < len(new) or any(
+        foot.name in taken for foot, old in zip(new, feet, strict=True) if foot is not old
+    )
+    return list(feet) if clash else new
 
 
 # ---- weights of the pose reward
