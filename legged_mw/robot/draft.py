@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +37,7 @@ from legged_mw.robot.measure import (
     suggest,
     what_joints_bear,
 )
-from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses
+from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses, walking_joints
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -75,6 +76,12 @@ class Draft(NamedTuple):
     gains_from: str  # source of the gains, as text
     judged: list[Judged]  # the poses that were judged, the chosen one first
     simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
+    angles: dict[str, float]  # joint -> default angle [rad], those that are held too
+
+    @property
+    def held(self) -> list[str]:
+        """The joints that do not walk."""
+        return [name for name in self.angles if name not in self.robot.joint_names]
 
 
 def draft(file: Path, simple: bool = False) -> Draft:
@@ -86,14 +93,19 @@ def draft(file: Path, simple: bool = False) -> Draft:
     rest = stand_as_statue(robot, np.clip(robot.pose, *robot.joint_range.T), place)
     feet = guess_feet(robot, rest.qpos)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
-    neutral = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
-    judged = judge_poses(robot, neutral, feet, maker, from_file)
-    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T)
+    judged = judge_poses(robot, feet, maker, from_file)
+    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T).round(4) + 0.0  # no -0.0
+    feet = guess_feet(robot, stand_as_statue(robot, pose, place).qpos)
+    angles = dict(zip(robot.joint_names, pose.tolist(), strict=True))
+    walking = walking_joints(robot.physics, feet)
+    held = [name for i, name in enumerate(robot.joint_names) if i not in walking]
+    if held:
+        robot = _bare(file, False, held, angles).robot
+        pose = np.array(robot.pose)
     rest = stand_as_statue(robot, pose, place)
-    feet = guess_feet(robot, rest.qpos)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
     how = ", ".join(filter(None, (judged[0].candidate.name, judged[0].candidate.source)))
-    pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
+    pose = pose.tolist()
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
     if height <= 0.0:
@@ -107,10 +119,14 @@ def draft(file: Path, simple: bool = False) -> Draft:
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         f"gains: {gains_from}",
     ]
+    if held:
+        guessed.append(f"held: {', '.join(patterns(held, robot.joint_names))}: {len(held)} joints that do not walk")
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     notes = [*read.notes, *more]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple)
+    return Draft(
+        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles
+    )
 
 
 def _servos(
@@ -165,13 +181,17 @@ def _stands(
     return stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands"
 
 
-def _bare(file: Path, keyframe: bool) -> RobotTask:
-    """One world with only the robot, in the pose of the file's ``keyframe`` or with all joints at 0."""
+def _bare(file: Path, keyframe: bool, held: Sequence[str] = (), angles: Mapping[str, float] | None = None) -> RobotTask:
+    """One world with only the robot, in the pose of the file's ``keyframe``, at ``angles``, or with all joints at 0."""
     cfg = RobotTaskCfg()
     fields = {
-        **{"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}},
+        **{
+            "env": {"num_envs": 1},
+            "asset": {"file": str(file.resolve()), "held_joints": [*held]},
+            "sim": {"engine": "mujoco"},
+        },
         "control": {"stiffness": {"": 1.0}, "damping": {"": 0.0}, "action_scale": 1.0},
-        "init_state": {"default_joint_angles": {} if keyframe else {"": 0.0}},
+        "init_state": {"default_joint_angles": {} if keyframe else {**(angles or {"": 0.0})}},
     }
     cfg.update(fields, where="the health page")
     return RobotTask(cfg, "cpu")
@@ -213,11 +233,13 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
         asset["joint_speed_limits"] = short_table(said, names)
+    if found.held:
+        asset["held_joints"] = patterns(found.held, names)
     asset |= _motors(found)
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
-        "init_state": {"pos": found.place, "default_joint_angles": table(found.pose, names)},
+        "init_state": {"pos": found.place, "default_joint_angles": table([*found.angles.values()], [*found.angles])},
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),
@@ -288,6 +310,18 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
         "perturbation": {"push": False, "velocity": [0.0, 4.0]},
         "rewards": rewards,
     }
+
+
+def patterns(held: Sequence[str], moving: Sequence[str]) -> list[str]:
+    """Short patterns that fit all ``held`` joints and none that moves: by the first word of a name without its side."""
+    found = list[str]()
+    for name in held:
+        words = family(name)
+        options = (f"*{words.partition('_')[0]}*", f"*{words}*", name)
+        fitting = next(each for each in options if not any(fnmatchcase(joint, each) for joint in moving))
+        if not any(fnmatchcase(name, each) for each in found):
+            found.append(fitting)
+    return found
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
