@@ -71,6 +71,7 @@ _COMMENTS = {
     "feet_impact_vel": "no stamping",
     "pose": "arms and waist quiet",
     "feet_orientation": "soles level",
+    "energy": "by its mass",
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
     "pose_weights": "how near the default pose each joint is to stay",
     "contact_phase": "one foot after the other; without it and no_fly a beginner hops [ours: docs/lab.md]",
@@ -149,6 +150,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     source = found.gains_from.replace("suggested below", "computed (legged_mw/robot/measure.py)")
     comments = {
         **_COMMENTS,
+        "held_joints": _held(found),
         "default_joint_angles": f"[rad] LOOK: {found.pose_from}",
         "stiffness": f"[N m/rad] LOOK: {source}",
     }
@@ -230,6 +232,11 @@ def _force_limits(found: Draft) -> list[str]:
     some = f"{endless[0]} and {len(endless) - 1} more" if endless[1:] else endless[0]
     some = "all joints" if len(endless) == len(found.joints) else some
     return [f'        # effort = {{"": 30.0}}  # [N m] LOOK: the file has no force limit for {some}; write yours']
+
+
+def _held(found: Draft) -> str:
+    every = len(found.angles)
+    return f"LOOK: {len(found.held)} joints that do not walk; without this line the task has {every} actions"
 
 
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
