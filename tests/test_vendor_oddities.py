@@ -12,7 +12,7 @@ from test_sim import build_toy, toy
 
 from legged_mw.robot.draft import draft
 from legged_mw.robot.mjcf import XmlSource
-from legged_mw.robot.new import class_name, targets, write
+from legged_mw.robot.new import as_mjcf, class_name, targets, write
 from legged_mw.robot.triangles import Triangles, read_triangles, thin, write_stl
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import read_file
@@ -320,3 +320,13 @@ def test_the_vendors_own_file_is_never_overwritten(tmp_path: Path) -> None:
         with pytest.raises(UserError, match="the robot's own file"):
             targets("toy", tmp_path, file, force)
     assert file.read_text() == text
+
+
+def test_a_class_may_name_a_material_that_is_not_there(tmp_path: Path) -> None:
+    """Lite3 of DeepRobotics: each geom of the class overrides it by nothing, which MuJoCo's writer leaves out."""
+    default = '<default><default class="look"><geom material="none"/></default></default>'
+    look = '<geom name="lid" class="look" material="" size="0.1" contype="0" conaffinity="0" mass="0"/>'
+    file = toy(tmp_path, inside=look, extra=default)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.xml").write_text(as_mjcf("mine", file, tmp_path / "out"))
+    assert read_robot(tmp_path / "out/mine.xml").spec.geom("lid") is not None

@@ -282,6 +282,10 @@ def as_mjcf(name: str, file: Path, folder: Path, parts: Path | None = None) -> s
         spec.compile()
         paths = _name_files(spec, XmlSource(file).folders)
         new = {} if parts is None else _copied(spec, paths, parts)
+        materials = {material.name for material in spec.materials}
+        for default in [geom.classname.geom for geom in spec.geoms]:
+            if default.material not in materials:  # of no element, as each overrides it by ""
+                default.material = ""
         text = spec.to_xml()
     for path in {*paths, *new}:
         there = new.get(path, path)
