@@ -248,6 +248,13 @@ def test_configured_kicks_are_the_tasks() -> None:
     )
 
 
+def test_what_is_shorter_than_a_step_lasts_one() -> None:
+    short = {"perturbation.interval": [0.001, 0.002], "perturbation.duration": [0.001, 0.005]}
+    kicks = make_env(2, {**KICKS, **QUIET, **short}).perturbation
+    kicks._redraw(torch.ones(2, dtype=torch.bool))
+    assert kicks._kick[:, :2].tolist() == [[1.0, 1.0]] * 2
+
+
 def test_reset_ends_a_kick_and_the_next_one_is_whole() -> None:
     env = make_env(N, {**KICKS, **QUIET})
     env.perturbation._kick.copy_(torch.tensor([2.0, 6.0, 0.5, 2.0]).expand(N, 4))

@@ -193,3 +193,24 @@ def test_its_chapter_in_the_report() -> None:
     fallen = {**column.exam["hard"], "looks": None}
     assert hard.misses(fallen)[-1] == "falls while it is looked at" and hard.figures(fallen) == []
     assert report._hard(Column("mine", {}, {"hard": fallen}))
+
+
+def test_published_policies_stand_beside_where_they_were_asked_alike() -> None:
+    """Both policies of a Go2: 0.05 and 0.05 in vx, 0.04 and 0.03 in vy, 0.03 and 0.04 in yaw rate without a hardship."""
+    go2 = ExamRules.from_mapping(
+        {"peer": "go2"}, {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1, 1]}
+    )
+    found = hard.beside(go2)
+    assert len(found["policies"]) == 2 and found["errors"]["none"] == [0.05, 0.03, 0.03]
+    assert found["pushes"] == {"all": 0.88} and found["looks"]["target_step"] == 0.034
+    wider = ExamRules.from_mapping(
+        {"peer": "go2"}, {"lin_vel_x": [-1, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1, 1]}
+    )
+    assert hard.beside(wider)["errors"] == {} and hard.beside(wider)["pushes"] == {"all": 0.88}
+    faster = ExamRules.from_mapping(
+        {"peer": "go2"}, {"lin_vel_x": [-1, 2.0], "lin_vel_y": [-1, 1], "ang_vel_yaw": [-1, 1]}
+    )
+    assert hard.beside(faster) == {} == hard.beside(RULES)
+    compared = hard.finish(go2, True, result()["conditions"], looks(walk()), 4, 3.0)
+    assert compared["peers"] == found and "best of 2" in hard.table(compared)
+    assert [row.peer for row in hard.figures(compared) if row.peer is not None] == [0.42, 0.62, 0.17, 0.034, 0.002]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -9,8 +10,10 @@ import pytest
 
 from legged_mw import ROOT
 from legged_mw.robot import makers
-from legged_mw.robot.draft import draft
+from legged_mw.robot.draft import draft, values
 from legged_mw.robot.makers import FILE, find_maker, read_makers
+from legged_mw.robot.measure import Joint, suggest
+from legged_mw.robot.new import config_text
 
 QUADRUPED = [f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf")]
 HUMANOID = [
@@ -122,3 +125,67 @@ def test_soles_are_level_whatever_the_angles_of_zero_are(tmp_path: Path) -> None
     assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(
         -0.4, abs=0.03
     )
+
+
+# ---- joints that do not walk ----
+
+
+def test_joints_that_do_not_walk_are_held() -> None:
+    found = draft(ROOT / "tests/data/g1_29dof_style.xml")
+    assert len(found.robot.joint_names) == 12 and len(found.held) == 17
+    said = values(found)
+    assert said["asset"]["held_joints"] == ["*waist*", "*shoulder*", "*elbow*", "*wrist*"]
+    assert found.angles["left_elbow_joint"] == 0.97
+    assert "17 joints that do not walk; without this line the task has 29 actions" in config_text(
+        found, Path("g1.xml"), "g1"
+    )
+
+
+# An arm of one link that points forward at 0, on a body beside the trunk of ``four_legs``; and a head above it.
+ARM = """<body name="{side}_arm" pos="0.2 {y} 0.05"><joint name="{side}_shoulder_joint" axis="0 1 0" range="-3 3"/>
+  <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="1"/></body>"""
+HEAD = """<body name="head" pos="0.3 0 0.1"><joint name="head_joint" axis="0 1 0" range="-1 1"/>
+  <geom size="0.05" pos="0.05 0 0.1" mass="1"/></body>"""
+
+
+def test_arms_hang_and_a_head_does_not(tmp_path: Path) -> None:
+    file = four_legs(tmp_path, ONE_WAY)
+    more = "".join(ARM.format(side=side, y=y) for side, y in (("left", 0.15), ("right", -0.15))) + HEAD
+    file.write_text(file.read_text().replace("</body></worldbody>", more + "</body></worldbody>"))
+    found = draft(file)
+    assert found.angles["left_shoulder_joint"] == pytest.approx(1.57, abs=0.1) and found.angles["head_joint"] == 0.0
+    assert values(found)["asset"]["held_joints"] == ["*shoulder*", "*head*"] and len(found.pose) == 8
+
+
+# a robot's weight times the height of its root [N m], and of some joints: torque limit [N m], published kp and kd
+PUBLISHED = {
+    "anymal_c": (281.0, [(80.0, 80.0, 2.0)]),
+    "a1": (37.0, [(20.0, 20.0, 0.5), (55.0, 20.0, 0.5)]),
+    "cassie": (253.0, [(112.0, 100.0, 3.0), (195.0, 200.0, 6.0), (45.0, 40.0, 1.0)]),
+    "h1": (530.0, [(200.0, 150.0, 2.0), (300.0, 200.0, 4.0), (40.0, 40.0, 2.0)]),
+    "g1": (271.0, [(88.0, 100.0, 2.0), (139.0, 150.0, 4.0), (50.0, 40.0, 2.0), (25.0, 40.0, 1.0)]),
+    "go2": (43.0, [(23.7, 25.0, 0.5), (45.4, 25.0, 0.5)]),
+    "b2": (431.0, [(200.0, 160.0, 5.0), (300.0, 160.0, 5.0)]),
+    "t1": (209.0, [(45.0, 200.0, 5.0), (60.0, 200.0, 5.0), (24.0, 50.0, 1.0)]),
+}
+
+
+def test_the_rule_of_gains_is_near_what_makers_publish() -> None:
+    """Within a factor of two for four of five, kp and kd; of numbers that the table itself has."""
+    near = []
+    for name, (moment, joints) in PUBLISHED.items():
+        maker = next(each for each in read_makers() if each.name == name)
+        for effort, kp, kd in joints:
+            assert kp in maker.kp.values() and kd in maker.kd.values(), name
+            joint = Joint("a", -1.0, 1.0, effort, math.inf, 0.0, 0.0, 0.0, 0.1, "default", 0.1, 0.0)
+            [gains] = suggest([joint], moment)
+            near += [abs(math.log(gains.kp / kp)) < math.log(2.0), abs(math.log(gains.kd / kd)) < math.log(2.0)]
+    assert sum(near) >= 0.75 * len(near) and len(near) == 40
+
+
+def test_every_gain_has_its_damping() -> None:
+    for maker in read_makers():
+        assert bool(maker.kp) == bool(maker.kd), maker.name
+        assert all(0.001 < value / maker.kp[key] < 0.3 for key, value in maker.kd.items() if key in maker.kp), (
+            maker.name
+        )

@@ -355,7 +355,7 @@ def test_a_new_task_overwrites_nothing(
     mine = tmp_path / "mine_flat.py"
     mine.write_text("of mine")
     text = complaint(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path)
-    assert "mine_flat.py exists; say --force to overwrite, or another name or --out DIR" in text
+    assert "mine_flat.py exists; say another name or --out DIR, or --force to overwrite" in text
     assert mine.read_text() == "of mine" and [*tmp_path.iterdir()] == [mine]
     show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path, "--force")
     assert mine.read_text() != "of mine" and (tmp_path / "mine.xml").read_bytes() == GO1.read_bytes()
@@ -458,7 +458,8 @@ def test_what_of_the_file_is_changed_is_on_its_page(
     a1, t1 = ROOT / "tests/data/a1_style.urdf", ROOT / "tests/data/t1_style.xml"
     text = show(monkeypatch, capsys, a1)
     assert (
-        "in the file\n  looks left out (MuJoCo reads no .dae, " in text and "\n  free joint added to 'base'\n" in text
+        "in the file\n  looks left out (no such file): package://a1_style_description/meshes/" in text
+        and "\n  free joint added to 'base'\n" in text
     )
     changed = show(monkeypatch, capsys, t1)
     assert "\n  12 actuators replaced\n  keyframe 'stand' read" in changed
@@ -660,7 +661,7 @@ def test_meshes_are_named_relative_to_the_new_file(tmp_path: Path, absolute: boo
     )
     text = text.replace('<site name="imu"', '<geom class="look" type="mesh" mesh="hull" mass="0"/><site name="imu"')
     (theirs / "toy.xml").write_text(text)
-    robot, _ = write(draft(theirs / "toy.xml"), theirs / "toy.xml", "mine", ours)
+    robot, *_ = write(draft(theirs / "toy.xml"), theirs / "toy.xml", "mine", ours, pack=False)
     assert 'file="../theirs/looks/hull.obj"' in robot.read_text() and str(tmp_path) not in robot.read_text()
     (tmp_path / "all").rename(tmp_path / "moved")
     moved = mujoco.MjModel.from_xml_path(str(tmp_path / "moved" / "ours" / "mine.xml"))
@@ -684,7 +685,7 @@ def test_meshes_of_an_attached_robot_are_named_relative_too(tmp_path: Path) -> N
         text.replace('<site name="imu"', '<attach model="arm" body="arm" prefix="right_"/><site name="imu"')
     )
     robot, config = write(
-        draft(tmp_path / "theirs/toy.xml"), tmp_path / "theirs/toy.xml", "mine", tmp_path / "ours/here"
+        draft(tmp_path / "theirs/toy.xml"), tmp_path / "theirs/toy.xml", "mine", tmp_path / "ours/here", pack=False
     )
     assert (
         'file="../../theirs/arms/left/parts/hull.obj"' in robot.read_text() and str(tmp_path) not in robot.read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import mujoco
@@ -10,8 +11,13 @@ import pytest
 from test_sim import build_toy, toy
 
 from legged_mw.robot.draft import draft
+from legged_mw.robot.mjcf import XmlSource
+from legged_mw.robot.new import class_name, targets, write
+from legged_mw.robot.triangles import Triangles, read_triangles, thin, write_stl
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.model import read_file
+from legged_mw.utils.errors import UserError
+from legged_mw.utils.task import load_task
 
 ONES = 'ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"'
 LEG = """<joint name="{0}_hip" type="revolute"><parent link="base"/><child link="{0}_leg"/><origin xyz="0 {1} 0"/>
@@ -143,3 +149,174 @@ def test_a_missing_mesh_that_is_no_collider_of_the_task_is_a_note(kind: str, tmp
     name = "base" if kind == "URDF" else "hull"
     with pytest.raises(ValueError, match="collides as the mesh"):
         build_toy(file, colliders=[*feet, name], contact_geoms=feet, **choices)
+
+
+# ---- looks: COLLADA, many triangles
+
+
+QUAD = """<?xml version="1.0"?>{doctype}<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"><asset><unit meter="0.01"/></asset>
+<library_geometries><geometry id="g"><mesh><source id="s"><float_array count="12">0 0 0 1 0 0 1 1 0 0 1 0.5</float_array>
+<technique_common><accessor stride="3"/></technique_common></source><vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
+{faces}</mesh></geometry></library_geometries><library_visual_scenes><visual_scene>{nodes}</visual_scene></library_visual_scenes></COLLADA>"""
+INPUTS = '<input semantic="VERTEX" source="#v" offset="0"/><input semantic="NORMAL" source="#n" offset="1"/>'
+TRIANGLES = f'<triangles count="2">{INPUTS}<p>0 0 1 0 2 0 0 0 2 0 3 0</p></triangles>'
+POLYLIST = f'<polylist count="1">{INPUTS}<vcount>4</vcount><p>0 0 1 0 2 0 3 0</p></polylist>'
+POLYGONS = f"<polygons>{INPUTS}<p>0 0 1 0 2 0 3 0</p></polygons>"
+NODE = '<node><translate>0 0 2</translate><rotate>0 0 1 90</rotate><instance_geometry url="#g"/></node>'
+
+
+def dae(file: Path, faces: str = TRIANGLES, nodes: str = NODE, doctype: str = "") -> Path:
+    file.write_text(QUAD.format(faces=faces, nodes=nodes, doctype=doctype))
+    return file
+
+
+@pytest.mark.parametrize("faces", [TRIANGLES, POLYLIST, POLYGONS])
+def test_triangles_of_a_dae_are_placed_by_its_nodes_in_metres(faces: str, tmp_path: Path) -> None:
+    mesh = read_triangles(dae(tmp_path / "a.dae", faces))
+    corners = 0.01 * np.array([[0, 0, 2], [0, 1, 2], [-1, 1, 2], [-1, 0, 2.5]])
+    first, second = mesh.points[mesh.faces]
+    np.testing.assert_allclose(first, corners[[0, 1, 2]], atol=1e-12)
+    np.testing.assert_allclose(second, corners[[0, 2, 3]], atol=1e-12)
+
+
+def test_a_mirrored_node_keeps_its_outside(tmp_path: Path) -> None:
+    for scale in ("1 1 1", "-1 1 1"):
+        mesh = read_triangles(
+            dae(tmp_path / "a.dae", nodes=f'<node><scale>{scale}</scale><instance_geometry url="#g"/></node>')
+        )
+        a, b, c = mesh.points[mesh.faces[0]]
+        assert np.cross(b - a, c - a)[2] > 0.0
+
+
+TWICE = "".join(
+    f'<node id="n{i}"><instance_node url="#n{i + 1}"/><instance_node url="#n{i + 1}"/></node>' for i in range(40)
+)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"doctype": '<!DOCTYPE a [<!ENTITY b "c">]>'},
+        {"nodes": TWICE},
+        {"nodes": '<node id="n"><instance_node url="#n"/></node>'},
+        {"nodes": "<node>" * 300 + "</node>" * 300},
+        {"nodes": '<node><rotate>0 0 1</rotate><instance_geometry url="#g"/></node>'},
+        {"nodes": '<node><matrix>1 2 3</matrix><instance_geometry url="#g"/></node>'},
+        {"nodes": '<node><scale>nan 1 1</scale><instance_geometry url="#g"/></node>'},
+        {"nodes": ""},
+        {"faces": TRIANGLES.replace("3 0</p>", "9 0</p>")},
+        {"faces": TRIANGLES.replace("3 0</p>", "-3 0</p>")},
+        {"faces": TRIANGLES.replace("3 0</p>", "3</p>")},
+        {"faces": TRIANGLES.replace("3 0</p>", f"{10**30} 0</p>")},
+        {"faces": TRIANGLES.replace("#v", "#w")},
+        {"faces": TRIANGLES.replace('offset="1"', f'offset="{10**12}"')},
+        {"faces": POLYLIST.replace("<vcount>4", "<vcount>-4 -1")},
+    ],
+)
+def test_a_hostile_dae_is_looks_that_are_left_out(wrong: dict[str, str], tmp_path: Path) -> None:
+    dae(tmp_path / "a.dae", **wrong)
+    with pytest.raises(ValueError):
+        read_triangles(tmp_path / "a.dae")
+    visual = '<visual><geometry><mesh filename="a.dae"/></geometry></visual>'
+    (line,) = [line for line in read_robot(urdf(tmp_path, base=visual)).notes if line.startswith("looks left out")]
+    assert "a.dae" in line
+
+
+def ball(turns: int) -> Triangles:
+    """A sphere of radius 1 m."""
+    polar, around = np.meshgrid(np.linspace(0, np.pi, turns), np.linspace(0, 2 * np.pi, turns), indexing="ij")
+    points = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
+    i = np.arange(turns * turns).reshape(turns, turns)
+    a, b, c, d = (each.ravel() for each in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    return Triangles(points.reshape(-1, 3), np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+
+
+def test_thinned_triangles_keep_the_shape() -> None:
+    few = thin(ball(200), 2000)
+    assert 500 < len(few.faces) <= 2000
+    np.testing.assert_allclose(np.linalg.norm(few.points, axis=1), 1.0, atol=0.02)
+    a, b, c = (few.points[few.faces[:, i]] for i in range(3))
+    outwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c)
+    assert (outwards > 0.0).mean() > 0.98
+    assert thin(few, 2000) is few
+
+
+def test_a_mesh_of_more_faces_than_mujoco_reads_is_looks(tmp_path: Path) -> None:
+    write_stl(ball(330), tmp_path / "shell.STL")
+    robot = read_robot(urdf(tmp_path, base='<visual><geometry><mesh filename="shell.STL"/></geometry></visual>'))
+    assert not any("left out" in line for line in robot.notes)
+    spec = robot.spec.copy()
+    spec.compiler.discardvisual = False
+    assert 1000 < spec.compile().nmeshface <= 5000
+
+
+# ---- a draft and what it needs
+
+
+def drafted(file: Path, folder: Path, **choices: bool) -> list[Path]:
+    found = draft(file)
+    return write(found, file, "mine", folder, **choices)
+
+
+def test_a_packed_draft_can_be_moved(tmp_path: Path) -> None:
+    """Looks are thinned, colliders are copied as they are, and nothing is named outside of the folder."""
+    vendor, made, moved = tmp_path / "vendor", tmp_path / "made", tmp_path / "moved"
+    (vendor / "meshes").mkdir(parents=True)
+    write_stl(ball(330), vendor / "meshes/shell.STL")
+    write_stl(ball(20), vendor / "meshes/hull.stl")
+    dae(vendor / "meshes/lid.dae")
+    parts = "".join(
+        f'<{kind}><geometry><mesh filename="package://vendor/meshes/{name}" scale="0.1 0.1 0.1"/></geometry></{kind}>'
+        for kind, name in (("visual", "shell.STL"), ("visual", "lid.dae"), ("collision", "hull.stl"))
+    )
+    file = urdf(vendor, base=parts)
+    robot, config, folder = drafted(file, made)
+    assert sorted(path.name for path in folder.iterdir()) == ["hull.stl", "shell_0.stl"]  # the lid is short text
+    assert (folder / "hull.stl").read_bytes() == (vendor / "meshes/hull.stl").read_bytes()
+    before = read_robot(file)
+    shutil.rmtree(vendor)
+    made.rename(moved)
+    after = read_robot(moved / robot.name)
+    assert not any("left out" in line for line in after.notes)
+    assert str(tmp_path) not in (moved / robot.name).read_text() and ".." not in (moved / robot.name).read_text()
+    assert XmlSource(moved / robot.name, alone=True).named
+    np.testing.assert_allclose(after.model.body_mass, before.model.body_mass, rtol=1e-5)
+    task = load_task(str(moved / config.name))
+    task.set("env.num_envs", 1)
+    task.set("sim.engine", "mujoco")
+    assert task.env_class(task.cfg, "cpu", eager=True).num_actions == 2
+
+
+def test_a_draft_may_name_the_files_where_they_lie(tmp_path: Path) -> None:
+    (tmp_path / "vendor").mkdir()
+    write_stl(ball(20), tmp_path / "vendor/hull.stl")
+    part = '<collision><geometry><mesh filename="hull.stl" scale="0.1 0.1 0.1"/></geometry></collision>'
+    robot, _ = drafted(urdf(tmp_path / "vendor", base=part), tmp_path / "made", pack=False)
+    assert 'file="../vendor/hull.stl"' in robot.read_text()
+
+
+def test_names_of_feet_and_classes() -> None:
+    assert [class_name(name) for name in ("h1_2", "my_dog", "b2", "g1_12dof", "a_1", "x2_y")] == [
+        *("H1_2", "MyDog", "B2", "G1_12dof", "A1", "X2Y"),
+    ]
+
+
+def test_a_foot_is_not_called_by_the_number_of_its_geom(tmp_path: Path) -> None:
+    """B2 of unitree_mujoco: its feet are the seventh geoms of its calves."""
+    shin = FOOT.replace("-0.2", "-0.1").replace("sphere", "box").replace('radius="0.03"', 'size="0.01 0.01 0.1"')
+    feet = draft(urdf(tmp_path, leg=shin + FOOT)).feet
+    assert [(foot.name, foot.geoms) for foot in feet] == [
+        ("left_foot", ("left_leg_1",)),
+        ("right_foot", ("right_leg_1",)),
+    ]
+
+
+def test_the_vendors_own_file_is_never_overwritten(tmp_path: Path) -> None:
+    write_stl(ball(20), tmp_path / "hull.stl")
+    asset = '<asset><mesh name="hull" file="hull.stl" scale="0.1 0.1 0.1"/></asset>'
+    file = toy(tmp_path, inside='<geom type="mesh" mesh="hull" mass="0"/>', extra=asset)
+    text = file.read_text()
+    for force in (False, True):
+        with pytest.raises(UserError, match="the robot's own file"):
+            targets("toy", tmp_path, file, force)
+    assert file.read_text() == text

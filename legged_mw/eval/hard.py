@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.eval.figures import stride_frequency
-from legged_mw.eval.walking import AXES, LOADS, ExamRules, Figure, Velocity
+from legged_mw.eval.walking import AXES, COMMON, LOADS, PEERS, ExamRules, Figure, Velocity
 
 Array = NDArray[Any]
 
@@ -243,6 +243,34 @@ def _number(value: Any) -> float | None:
     return round(float(value), 5) if math.isfinite(value) else None
 
 
+# ---- published policies that were measured alike -----------------------------------------------------------------------
+
+
+BETTER = ("target_step", "fast_share", "hit", "hardest_hit", "torque_over_limit")  # figures of a walk: less is better
+
+
+def beside(rules: ExamRules) -> dict[str, Any]:
+    """Names of the published policies of this robot with a hard exam, and the best of each figure of theirs.
+
+    ``errors`` of a condition only where the range is theirs; ``pushes`` and ``looks`` where the speed is. Empty without any.
+    """
+    measured = {peer.name: peer.hard for peer in PEERS.get(rules.peer, []) if peer.hard}
+    common = COMMON.get(rules.peer)
+    if not measured or not common or common[0][1] != rules.ranges[0][1]:
+        return {}
+    every = list(measured.values())
+    conditions = [each.name for each in CONDITIONS]
+    errors = {name: [each["errors"][name] for each in every if name in each["errors"]] for name in conditions}
+    pushes = {name: [each["pushes"][name] for each in every if name in each["pushes"]] for name in conditions}
+    alike = common == rules.ranges
+    return {
+        "policies": list(measured),
+        "errors": {name: [min(axis) for axis in zip(*found, strict=True)] for name, found in errors.items() if alike},
+        "pushes": {name: max(found) for name, found in pushes.items() if found},
+        "looks": {name: min(each["looks"][name] for each in every) for name in BETTER},
+    }
+
+
 # ---- the marks ------------------------------------------------------------------------------------------------------
 
 
@@ -274,6 +302,8 @@ def finish(
         "push_speed": push_speed(feet),
         "load": load,
     }
+    if published := beside(rules):
+        result["peers"] = published
     result["misses"] = misses(result)
     return {**result, "ready": not result["misses"]}
 
@@ -304,7 +334,8 @@ def figures(result: Mapping[str, Any]) -> list[Figure]:
     found = result["looks"]
     if not found:
         return []
-    said = {key: (found[key] or {}) for key in ("hit", "torque_over_limit")}
+    hit, torque = (found[key] or {} for key in ("hit", "torque_over_limit"))
+    best = result.get("peers", {}).get("looks", {})
     rows = [
         Figure("trunk's largest tilt [deg]", trunk(found), 1, TRUNK),
         Figure("  roll, mean", found["roll"]["mean"], 1),
@@ -325,15 +356,35 @@ def figures(result: Mapping[str, Any]) -> list[Figure]:
         Figure("share of all feet down", found["all_down"], 2),
         Figure("angle at a limit, worst joint", found["angle_at_limit"]["worst"], 3, LIMITS),
         Figure("target at a limit, worst joint", found["target_at_limit"]["worst"], 3, LIMITS),
-        Figure("hit at touchdown [weights]", said["hit"].get("mean"), 2, without="none"),
-        Figure("  the hardest", said["hit"].get("most"), 2, without="none"),
+        Figure("hit at touchdown [weights]", hit.get("mean"), 2, None, best.get("hit"), without="none"),
+        Figure("  the hardest", hit.get("most"), 2, None, best.get("hardest_hit"), without="none"),
         Figure(
-            "torque RMS / limit, worst joint", said["torque_over_limit"].get("worst"), 2, TORQUE, without="no limit"
+            "torque RMS / limit, worst joint",
+            torque.get("worst"),
+            2,
+            TORQUE,
+            best.get("torque_over_limit"),
+            without="none",
         ),
-        Figure("target's mean step [rad]", found["target_step"], 3),
-        Figure("target's power above 10 Hz", found["fast_share"], 3, without="none"),
+        Figure("target's mean step [rad]", found["target_step"], 3, None, best.get("target_step")),
+        Figure("target's power above 10 Hz", found["fast_share"], 3, None, best.get("fast_share"), without="none"),
         Figure("peak power [W]", found["peak_power"], 0),
     ]
+
+
+def peer_label(result: Mapping[str, Any]) -> str:
+    """The heading above the published policies' figures; empty without any."""
+    count = len(result.get("peers", {}).get("policies", ()))
+    return f"best of {count}" if count else ""
+
+
+def _beside(published: Mapping[str, Any], name: str) -> str:
+    """The published policies' errors and pushes under one condition, as the table's last columns."""
+    error, share = published["errors"].get(name), published["pushes"].get(name)
+    if error is None and share is None:
+        return ""
+    errors = ", ".join(f"{value:.2f}" for value in error) if error else ""
+    return f"{errors:>26}{'' if share is None else f'{share:.2f}':>10}"
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -341,15 +392,19 @@ def table(result: Mapping[str, Any]) -> str:
     names = ", ".join(name.removesuffix(" rate") for name, _ in AXES)
     pushed = f"pushes of {result['push_speed']:g} m/s"
     lines = [f"hard exam: {len(result['commands'])} commands and {PUSH_DIRECTIONS} pushes under each condition"]
-    lines.append(f"{'':<16}{'falls':>6}{f'error {names}':>24}{'drift [m]':>11}{pushed:>20}")
+    published, label = result.get("peers", {"errors": {}, "pushes": {}}), peer_label(result)
+    theirs = f"{f'errors, pushes of {label}':>36}" if label else ""
+    lines.append(f"{'':<16}{'falls':>6}{f'error {names}':>24}{'drift [m]':>11}{pushed:>20}{theirs}")
     for name, each in result["conditions"].items():
         error = ", ".join(f"{value:.3f}" for value in each["error"])
         drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
         title = f"{name} {result['load']:g} kg" if name == "load" else name
-        lines.append(f"{title:<16}{each['falls']:>6}{error:>24}{drift:>11}{each['pushes']:>20.2f}")
+        lines.append(
+            f"{title:<16}{each['falls']:>6}{error:>24}{drift:>11}{each['pushes']:>20.2f}{_beside(published, name)}"
+        )
     at = f"walking at {result['vx']:g} m/s"
-    lines += ["", f"{at:<34}{'this policy':>12}{'ready at':>10}"]
+    lines += ["", f"{at:<34}{'this policy':>12}{'ready at':>10}{label:>12}".rstrip()]
     for row in figures(result):
-        lines.append(f"{row.name:<34}{row.text(row.value):>12}{row.mark_text():>10}".rstrip())
+        lines.append(f"{row.name:<34}{row.text(row.value):>12}{row.mark_text():>10}{row.peer_text():>12}".rstrip())
     ready = "yes" if result["ready"] else f"no: {'; '.join(result['misses'])}"
     return "\n".join([*lines, f"ready for a robot: {ready}"])

@@ -114,7 +114,9 @@ def _hard(column: Column) -> str:
         drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
         title = f"load of {result['load']:g} kg" if name == "load" else name
         rows.append([title, str(each["falls"]), error, drift, f"{each['pushes']:.0%}"])
-    looked = exam_table([column], [hard.figures(result)], "", "ready at") if result["looks"] else ""
+    looked = (
+        exam_table([column], [hard.figures(result)], hard.peer_label(result), "ready at") if result["looks"] else ""
+    )
     missed = f"<p>Not ready: {escape('; '.join(result['misses']))}.</p>" if result["misses"] else ""
     lead = TEXTS["hard"].format(count=len(result["commands"]), pushes=hard.PUSH_DIRECTIONS, vx=result["vx"])
     strip = picture(column.strip, "one stride, from the side and from the front") if column.strip else ""

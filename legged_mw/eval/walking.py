@@ -52,6 +52,7 @@ class Peer(NamedTuple):
     asked: dict[str, Any]  # values of the ExamRules fields that affect its figures
     figures: dict[str, Any]  # the known keys of an exam's result
     own_speed: bool = False  # pushes and cost of transport at half its own top speed, whatever the ranges
+    hard: dict[str, Any] | None = None  # its figures in the hard exam, in the common range
 
     def fits(self, rules: ExamRules) -> bool:
         """Whether it was measured by the same commands and pushes as ``rules``."""
@@ -84,8 +85,8 @@ def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, f
             own = {"ranges": tuple((-highest, highest) for highest in each["trained"]), **asked}
             peers[robot].append(Peer(each["name"], own, {"falls": 0, **each["own"], **rest}))
             if "common" in each:
-                alike = {"ranges": common[robot], **asked}
-                peers[robot].append(Peer(each["name"], alike, {"falls": 0, **each["common"], **rest}, own_speed=True))
+                alike, found = {"ranges": common[robot], **asked}, {"falls": 0, **each["common"], **rest}
+                peers[robot].append(Peer(each["name"], alike, found, own_speed=True, hard=each.get("hard")))
     return peers, common, loads
 
 

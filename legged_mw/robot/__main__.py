@@ -31,6 +31,12 @@ def parse() -> argparse.Namespace:
         "--sim", action="store_true", help="--new writes a task for simulation alone: a told velocity, alike worlds"
     )
     parser.add_argument("--force", action="store_true", help="--new may overwrite")
+    parser.add_argument(
+        "--pack",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="--new copies meshes and pictures into NAME_parts, looks with fewer triangles, so that the folder can be moved",
+    )
     args = parser.parse_args()
     if args.picture is not None:
         writable(args.picture, "--picture")
@@ -48,12 +54,13 @@ def main() -> None:
         return
     if args.new:
         # refuse before the page, not after it
-        new.targets(args.new, writable(args.out, "--out", folder=True), args.force)
+        new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
     found = draft(file, args.sim)
     env = as_env(found, file)
     show(env, file.name, image, found)
     if args.new:
-        written = new.write(found, file, args.new, Path(args.out), args.force, has_mirror(env))
+        out, mirrors = Path(args.out), has_mirror(env)
+        written = new.write(found, file, args.new, out, force=args.force, mirrors=mirrors, pack=args.pack)
         flags = shlex.join(["--task", shown(written[1]), "--check"])
         print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} {flags}")
 

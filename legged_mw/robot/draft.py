@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +37,7 @@ from legged_mw.robot.measure import (
     suggest,
     what_joints_bear,
 )
-from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses
+from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses, walking_joints
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -51,7 +53,9 @@ FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
 # reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
 # soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
-LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.5}
+LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25}
+# of `energy`, per kilogram: BipedCfg's -0.002 of a G1 of 35 kg, Playground's -0.001 of a Go1 of 13 kg
+ENERGY = {2: -0.07, 4: -0.013}
 LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "pose": 1.0, "action_rate": -0.02, "feet_orientation": -1.0}
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
@@ -72,6 +76,12 @@ class Draft(NamedTuple):
     gains_from: str  # source of the gains, as text
     judged: list[Judged]  # the poses that were judged, the chosen one first
     simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
+    angles: dict[str, float]  # joint -> default angle [rad], those that are held too
+
+    @property
+    def held(self) -> list[str]:
+        """The joints that do not walk."""
+        return [name for name in self.angles if name not in self.robot.joint_names]
 
 
 def draft(file: Path, simple: bool = False) -> Draft:
@@ -83,14 +93,19 @@ def draft(file: Path, simple: bool = False) -> Draft:
     rest = stand_as_statue(robot, np.clip(robot.pose, *robot.joint_range.T), place)
     feet = guess_feet(robot, rest.qpos)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
-    neutral = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
-    judged = judge_poses(robot, neutral, feet, maker, from_file)
-    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T)
+    judged = judge_poses(robot, feet, maker, from_file)
+    pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T).round(4) + 0.0  # no -0.0
+    feet = guess_feet(robot, stand_as_statue(robot, pose, place).qpos)
+    angles = dict(zip(robot.joint_names, pose.tolist(), strict=True))
+    walking = walking_joints(robot.physics, feet)
+    held = [name for i, name in enumerate(robot.joint_names) if i not in walking]
+    if held:
+        robot = _bare(file, False, held, angles).robot
+        pose = np.array(robot.pose)
     rest = stand_as_statue(robot, pose, place)
-    feet = guess_feet(robot, rest.qpos)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
     how = ", ".join(filter(None, (judged[0].candidate.name, judged[0].candidate.source)))
-    pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
+    pose = pose.tolist()
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
     if height <= 0.0:
@@ -104,10 +119,14 @@ def draft(file: Path, simple: bool = False) -> Draft:
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         f"gains: {gains_from}",
     ]
+    if held:
+        guessed.append(f"held: {', '.join(patterns(held, robot.joint_names))}: {len(held)} joints that do not walk")
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     notes = [*read.notes, *more]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple)
+    return Draft(
+        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles
+    )
 
 
 def _servos(
@@ -162,13 +181,17 @@ def _stands(
     return stand_on_servos(firm, np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands"
 
 
-def _bare(file: Path, keyframe: bool) -> RobotTask:
-    """One world with only the robot, in the pose of the file's ``keyframe`` or with all joints at 0."""
+def _bare(file: Path, keyframe: bool, held: Sequence[str] = (), angles: Mapping[str, float] | None = None) -> RobotTask:
+    """One world with only the robot, in the pose of the file's ``keyframe``, at ``angles``, or with all joints at 0."""
     cfg = RobotTaskCfg()
     fields = {
-        **{"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}},
+        **{
+            "env": {"num_envs": 1},
+            "asset": {"file": str(file.resolve()), "held_joints": [*held]},
+            "sim": {"engine": "mujoco"},
+        },
         "control": {"stiffness": {"": 1.0}, "damping": {"": 0.0}, "action_scale": 1.0},
-        "init_state": {"default_joint_angles": {} if keyframe else {"": 0.0}},
+        "init_state": {"default_joint_angles": {} if keyframe else {**(angles or {"": 0.0})}},
     }
     cfg.update(fields, where="the health page")
     return RobotTask(cfg, "cpu")
@@ -210,15 +233,17 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
         asset["joint_speed_limits"] = short_table(said, names)
+    if found.held:
+        asset["held_joints"] = patterns(found.held, names)
     asset |= _motors(found)
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
-        "init_state": {"pos": found.place, "default_joint_angles": table(found.pose, names)},
+        "init_state": {"pos": found.place, "default_joint_angles": table([*found.angles.values()], [*found.angles])},
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),
-            "action_scale": _action_scale(found),
+            "action_scale": 0.5 if found.simple else 0.25,
         },
         "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
@@ -226,21 +251,21 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if beyond_euler(found.joints, found.gains, float(found.robot.physics.opt.timestep)):
         chosen["sim"] = dict(IMPLICIT)
     low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
-    if chosen["control"]["action_scale"] < 0.5:
+    if not found.simple:
         chosen["normalization"] = {"clip_actions": 4.0}
     if len(found.feet) == 2:
         return {**chosen, **_of_a_biped(found, low)}
     if found.simple:
         return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
-    rewards = {**low, "pose_weights": weights, "scales": dict(LOOKS)}
+    rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
     return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "rewards": rewards}
 
 
-def _action_scale(found: Draft) -> float:
-    """How far an action of 1 moves a joint [rad]: less where 0.5 rad ask for more than 0.7 of most motors' effort."""
-    asked = sorted(gain.kp / joint.effort for gain, joint in zip(found.gains, found.joints, strict=True))
-    return 0.5 if 0.5 * asked[len(asked) // 2] <= 0.7 else 0.25
+def _energy(found: Draft) -> dict[str, float]:
+    """The scale of `energy`: a heavier robot needs more power to walk as fast."""
+    mass = float(found.robot.physics.body_subtreemass[0])
+    return {"energy": float(f"{ENERGY.get(len(found.feet), ENERGY[4]) / mass:.2g}")}
 
 
 def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
@@ -268,7 +293,11 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
         **low,
         "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
         "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
-        "scales": {"contact_phase": 1.0, "no_fly": 0.5, **({} if found.simple else LOOKS_OF_A_BIPED)},
+        "scales": {
+            "contact_phase": 1.0,
+            "no_fly": 0.5,
+            **({} if found.simple else {**LOOKS_OF_A_BIPED, **_energy(found)}),
+        },
     }
     worlds = _worlds(found, (-0.03, 0.06))
     if not found.simple:
@@ -281,6 +310,18 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
         "perturbation": {"push": False, "velocity": [0.0, 4.0]},
         "rewards": rewards,
     }
+
+
+def patterns(held: Sequence[str], moving: Sequence[str]) -> list[str]:
+    """Short patterns that fit all ``held`` joints and none that moves: by the first word of a name without its side."""
+    found = list[str]()
+    for name in held:
+        words = family(name)
+        options = (f"*{words.partition('_')[0]}*", f"*{words}*", name)
+        fitting = next(each for each in options if not any(fnmatchcase(joint, each) for joint in moving))
+        if not any(fnmatchcase(name, each) for each in found):
+            found.append(fitting)
+    return found
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
@@ -347,7 +388,7 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
         ]
         if body not in soles and same and len(of_body[same[0]]) == len(these):
             soles[body] = [geom for geom, like in zip(these, of_body[same[0]], strict=True) if like in soles[same[0]]]
-    return [_foot(robot, body, soles[body]) for body in sorted(soles)]
+    return _renamed(robot, [_foot(robot, body, soles[body]) for body in sorted(soles)])
 
 
 def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
@@ -377,7 +418,23 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]
     if parts:
         return Foot(parts[-1], names, True)
-    return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)
+    owner = robot.physics.body(body).name
+    return Foot(names[0], names, True) if len(names) == 1 else Foot(owner, names, False)
+
+
+def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
+    """Feet whose name is that of a geom, as FL_calf_4, are called by their side: FL_foot, if nothing else is."""
+    new = list[Foot]()
+    for foot in feet:
+        owner = robot.physics.body(int(robot.physics.geom(foot.geoms[0]).bodyid[0])).name
+        side = [part for part in owner.split("_") if part not in (*family(owner).split("_"), "joint")]
+        plain = re.fullmatch(rf"{re.escape(owner)}_\d+", foot.name) and side
+        new.append(Foot("_".join([*side, "foot"]), foot.geoms, False) if plain else foot)
+    taken = {*robot.names.geoms, *robot.names.bodies, *(foot.name for foot in feet)}
+    clash = len({foot.name for foot in new}) < len(new) or any(
+        foot.name in taken for foot, old in zip(new, feet, strict=True) if foot is not old
+    )
+    return list(feet) if clash else new
 
 
 # ---- weights of the pose reward

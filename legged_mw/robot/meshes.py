@@ -8,17 +8,19 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from legged_mw.robot.triangles import thinned
 from legged_mw.sim.robot_file import compile_copy
 from legged_mw.utils.errors import ModelError
 
-READABLE = (".stl", ".obj", ".msh")  # mesh formats of MuJoCo's reader
+READABLE = (".stl", ".obj", ".msh", ".dae")  # mesh formats of MuJoCo's reader, and ours
+FACES_OF_LOOKS, _FACES_OF_COLLIDERS = 5_000, 100_000  # more are thinned [ours: a link on a screen]
 INSTEAD = 'give the geom a primitive shape, or let it not collide (contype="0" conaffinity="0")'
 
 
 def why_unreadable(path: Path) -> str:
-    """The reason why MuJoCo cannot read a mesh file, judged by its name and existence; "" if there is none."""
+    """The reason why a mesh file cannot be read, judged by its name and existence; "" if there is none."""
     if path.suffix.lower() not in READABLE:
-        return f"MuJoCo reads no {path.suffix or 'file without an ending'}, only {', '.join(READABLE)}"
+        return f"no {path.suffix or 'file without an ending'} is read, only {', '.join(READABLE)}"
     return "" if path.is_file() else "no such file"
 
 
@@ -37,6 +39,8 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str], lost: di
         }
         if not any(broken.values()) and not _missing_pictures(spec) and not _missing_skins(spec):
             raise
+    for name in [name for name, reason in broken.items() if reason]:
+        broken[name] = _mend(spec, name, broken[name])
     _drop(spec, broken, where, notes, lost)
     _drop_pictures(spec, notes)
     return compile_copy(spec)
@@ -48,7 +52,8 @@ def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: li
     for mesh in [mesh for mesh in spec.meshes if reasons.get(mesh.name)]:
         reason, collides = reasons[mesh.name], False
         for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
-            _refuse_mass(spec, geom, mesh, reason, where)
+            if _gives_mass(geom):
+                raise ModelError(f"{where}: {_whats_wrong(spec, geom, 'takes its mass from', mesh, reason)}")
             if geom.contype or geom.conaffinity:
                 collides = True
                 text = f"{where}: {_whats_wrong(spec, geom, 'collides as', mesh, reason)}"
@@ -62,6 +67,23 @@ def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: li
         notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
 
 
+def _mend(spec: mujoco.MjSpec, name: str, reason: str) -> str:
+    """Read and thin a mesh that MuJoCo cannot read, such as a .dae or a large .stl. "", or why that failed."""
+    mesh, path = spec.mesh(name), path_of(spec, spec.mesh(name))
+    if why_unreadable(path):
+        return reason
+    geoms = [geom for geom in spec.geoms if geom.meshname == name]
+    looks = not any(matters(geom) for geom in geoms)
+    try:
+        points, faces = thinned(path.resolve(), FACES_OF_LOOKS if looks else _FACES_OF_COLLIDERS)
+    except (ValueError, OSError) as error:
+        return f"{reason}; {error}"
+    mesh.file, mesh.uservert, mesh.userface = "", points.ravel(), faces.ravel()
+    if looks:  # an open surface has no volume
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    return _read_error(spec, mesh)
+
+
 def path_of(spec: mujoco.MjSpec, item: mujoco.MjsMesh | mujoco.MjsTexture | mujoco.MjsSkin, file: str = "") -> Path:
     """The path of a mesh, skin or texture, or of ``file`` in the same folder."""
     folder, name = spec.texturedir if isinstance(item, mujoco.MjsTexture) else spec.meshdir, Path(file or item.file)
@@ -71,7 +93,9 @@ def path_of(spec: mujoco.MjSpec, item: mujoco.MjsMesh | mujoco.MjsTexture | mujo
 def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     """MuJoCo's error for the mesh alone; "" if it compiles."""
     alone = mujoco.MjSpec()
-    alone.add_mesh(name="mesh", file=str(path_of(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
+    file = str(path_of(spec, mesh).resolve()) if mesh.file else ""
+    copy = alone.add_mesh(name="mesh", file=file, scale=mesh.scale, inertia=mesh.inertia)
+    copy.uservert, copy.userface = mesh.uservert, mesh.userface
     alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0, density=0.0)
     try:
         alone.compile()
@@ -80,12 +104,13 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     return ""
 
 
-def _refuse_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str) -> None:
-    gives_mass = (
-        not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
-    )
-    if gives_mass:
-        raise ModelError(f"{where}: {_whats_wrong(spec, geom, 'takes its mass from', mesh, reason)}")
+def matters(geom: mujoco.MjsGeom) -> bool:
+    """Whether a geom is more than looks: it collides, or gives its body mass."""
+    return bool(geom.contype or geom.conaffinity) or _gives_mass(geom)
+
+
+def _gives_mass(geom: mujoco.MjsGeom) -> bool:
+    return not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
 
 
 def _whats_wrong(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, role: str, mesh: mujoco.MjsMesh, reason: str) -> str:

@@ -7,21 +7,25 @@ import os
 import re
 import shutil
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import mujoco
+import numpy as np
 
 from legged_mw.robot.draft import Draft, parents, values
-from legged_mw.robot.meshes import path_of
+from legged_mw.robot.meshes import FACES_OF_LOOKS, matters, path_of
 from legged_mw.robot.mjcf import XmlSource
+from legged_mw.robot.triangles import Triangles, thinned, write_stl
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.robot_file import naming
 from legged_mw.utils.errors import UserError, shown
 
 WIDTH = 140  # [columns] longest line of the config
+_SHORT = 300  # faces of a mesh that stays in the text
 
 _HEAD = '''"""{title} ({legs}, {joints} joints; {file}) follows a joystick on flat ground. Check what is marked LOOK."""
 
@@ -67,48 +71,75 @@ _COMMENTS = {
     "feet_impact_vel": "no stamping",
     "pose": "arms and waist quiet",
     "feet_orientation": "soles level",
+    "energy": "by its mass",
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
     "pose_weights": "how near the default pose each joint is to stay",
     "contact_phase": "one foot after the other; without it and no_fly a beginner hops [ours: docs/lab.md]",
 }
 
 
-def targets(name: str, folder: Path, force: bool = False) -> tuple[Path, Path]:
-    """The paths of the two files of the task ``name``. Raises UserError for an invalid name or an existing file."""
+def targets(name: str, folder: Path, file: Path, force: bool = False) -> tuple[Path, Path]:
+    """The paths of the two files of the task ``name`` for the robot in ``file``.
+
+    Raises UserError for an invalid name or an existing file; ``force`` allows one that is not ``file``.
+    """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise UserError(f"--new {name}: a name begins with a letter and has letters, digits and _ only")
     robot, config = folder / f"{name}.xml", folder / f"{name}_flat.py"
+    with naming(file):
+        is_own = robot.exists() and file.exists() and robot.samefile(file) and not stands_alone(file)
+    if is_own:
+        raise UserError(f"{shown(robot)} is the robot's own file, which stays as it is; say another name or --out DIR")
     there = [path for path in (robot, config) if path.exists()]
     if there and not force:
         raise UserError(
-            f"{' and '.join(shown(path) for path in there)} exists; say --force to overwrite, or another name or --out DIR"
+            f"{' and '.join(shown(path) for path in there)} exists; say another name or --out DIR, or --force to overwrite"
         )
     return robot, config
 
 
-def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False, mirrors: bool = False) -> list[Path]:
-    """Write both files into ``folder``. ``mirrors``: the robot is symmetric, see ``has_mirror``. Raises UserError."""
-    robot, config = targets(name, folder, force)
+def write(
+    found: Draft,
+    file: Path,
+    name: str,
+    folder: Path,
+    *,
+    force: bool = False,
+    mirrors: bool = False,
+    pack: bool = True,
+) -> list[Path]:
+    """Write both files into ``folder``, and with ``pack`` the robot's meshes and pictures into a folder beside them.
+
+    ``mirrors``: the robot is symmetric, see ``has_mirror``. Returns what was written. Raises UserError.
+    """
+    robot, config = targets(name, folder, file, force)
+    parts = folder / f"{name}_parts"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if stands_alone(file):
             if not (robot.exists() and robot.samefile(file)):
                 shutil.copyfile(file, robot)
         else:
-            robot.write_text(as_mjcf(name, file, folder))
+            robot.write_text(as_mjcf(name, file, folder, parts if pack else None))
         config.write_text(config_text(found, file, name, mirrors))
     except OSError as error:
         raise UserError(
             f"cannot write to {shown(folder)}: {error.strerror or os.strerror(error.errno or 0)}; say --out DIR"
         ) from None
-    return [robot, config]
+    return [robot, config, *([parts] if pack and parts.exists() else [])]
+
+
+def class_name(name: str) -> str:
+    """``name`` in capitals: "my_dog" is MyDog; an underscore between digits stays, "h1_2" is H1_2."""
+    capitals = "_".join(part[:1].upper() + part[1:] for part in name.split("_"))
+    return re.sub(r"(?<!\d)_|_(?!\d)", "", capitals)
 
 
 def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> str:
     """The text of the config file. LOOK marks values to check."""
     feet = len(found.feet)
     legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
-    title = "".join(part.capitalize() for part in name.split("_"))
+    title = class_name(name)
     base, train = (parent.__name__ for parent in parents(found))
     names = {"imports": _imports(found), "cfg": base, "real": "" if found.simple else _before_a_real_robot(found)}
     lines = [
@@ -119,6 +150,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     source = found.gains_from.replace("suggested below", "computed (legged_mw/robot/measure.py)")
     comments = {
         **_COMMENTS,
+        "held_joints": _held(found),
         "default_joint_angles": f"[rad] LOOK: {found.pose_from}",
         "stiffness": f"[N m/rad] LOOK: {source}",
     }
@@ -202,6 +234,11 @@ def _force_limits(found: Draft) -> list[str]:
     return [f'        # effort = {{"": 30.0}}  # [N m] LOOK: the file has no force limit for {some}; write yours']
 
 
+def _held(found: Draft) -> str:
+    every = len(found.angles)
+    return f"LOOK: {len(found.held)} joints that do not walk; without this line the task has {every} actions"
+
+
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
     """``name = value  # comment``, split into several lines if it is longer than WIDTH."""
     space, note = " " * indent, f"  # {comment}" if comment else ""
@@ -229,8 +266,11 @@ def stands_alone(file: Path) -> bool:
     return source.root.tag == "mujoco" and not source.named
 
 
-def as_mjcf(name: str, file: Path, folder: Path) -> str:
-    """The robot in ``file`` as MJCF text for ``folder``, with mesh paths relative to ``folder``."""
+def as_mjcf(name: str, file: Path, folder: Path, parts: Path | None = None) -> str:
+    """The robot in ``file`` as MJCF text for ``folder``, with mesh paths relative to ``folder``.
+
+    With ``parts``, a folder in it, the files are copied there, else the text names them where they are.
+    """
     robot = read_robot(file)
     spec = robot.spec
     for joint in robot.joints:
@@ -241,26 +281,75 @@ def as_mjcf(name: str, file: Path, folder: Path) -> str:
     with naming(file):
         spec.compile()
         paths = _name_files(spec, XmlSource(file).folders)
+        new = {} if parts is None else _copied(spec, paths, parts)
         text = spec.to_xml()
-    for path in paths:
-        text = text.replace(f'"{escape(str(path))}"', f'"{escape(os.path.relpath(path, folder.resolve()))}"')
+    for path in {*paths, *new}:
+        there = new.get(path, path)
+        text = text.replace(f'"{escape(str(path))}"', f'"{escape(os.path.relpath(there, folder.resolve()))}"')
     return text
 
 
 def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
-    """Give meshes and textures absolute paths, and return these. Missing files keep their paths."""
+    """Give meshes, skins and textures absolute paths, and return these. Missing files keep their paths."""
     found: set[Path] = set()
 
-    def named(item: mujoco.MjsMesh | mujoco.MjsTexture, file: str) -> str:
-        own = item.compiler.meshdir if isinstance(item, mujoco.MjsMesh) else item.compiler.texturedir
+    def named(item: mujoco.MjsMesh | mujoco.MjsTexture | mujoco.MjsSkin, file: str) -> str:
+        own = item.compiler.texturedir if isinstance(item, mujoco.MjsTexture) else item.compiler.meshdir
         places = [path_of(spec, item, file), *(Path(folder) / own / file for folder in folders)]
         path = next((place.resolve() for place in places if file and place.is_file()), None)
         found.update([path] if path else [])
         return str(path) if path else file
 
-    for item in (*spec.meshes, *spec.textures):
+    for item in (*spec.meshes, *spec.textures, *spec.skins):
         item.file = named(item, item.file)
     for texture in spec.textures:
         texture.cubefiles = [named(texture, file) for file in texture.cubefiles]
     spec.meshdir, spec.texturedir, spec.strippath = "", "", False
     return found
+
+
+def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[Path, Path]:
+    """Copy files into ``parts``, looks thinned, and return old -> new place. Meshes in the text become files, too."""
+    new: dict[Path, Path] = {}
+    long = [mesh for mesh in spec.meshes if len(mesh.userface) > _SHORT and not len(mesh.usertexcoord)]
+    if paths or long:
+        parts.mkdir(exist_ok=True)
+    for mesh in long:
+        place = parts.resolve() / _unused(f"{mesh.name}.stl", new.values())
+        write_stl(Triangles(np.reshape(mesh.uservert, (-1, 3)), np.reshape(mesh.userface, (-1, 3))), place)
+        mesh.file, mesh.uservert, mesh.userface, mesh.usernormal = str(place), [], [], []
+        new[place] = place
+    for path in sorted(paths):
+        meshes = [mesh for mesh in spec.meshes if mesh.file == str(path)]
+        look = None
+        if meshes and all(_is_look(spec, mesh) for mesh in meshes):
+            with suppress(ValueError):  # MuJoCo alone reads it, such as a .msh
+                look = thinned(path, FACES_OF_LOOKS)
+        name = path.name if look is None else f"{path.stem}.stl"
+        new[path] = parts.resolve() / _unused(name, new.values())
+        if look is None:
+            shutil.copyfile(path, new[path])
+            continue
+        write_stl(look, new[path])
+        for mesh in meshes:
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a thinned surface may be open
+    return new
+
+
+def _is_look(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
+    """Whether a mesh is shown alone, in one colour, so that its exact shape does not matter."""
+    geoms = [geom for geom in spec.geoms if geom.meshname == mesh.name]
+    pictured = {material.name for material in spec.materials if any(material.textures)}
+    worn = {mesh.material, *(geom.material for geom in geoms)}
+    return not pictured & worn and not any(matters(geom) for geom in geoms)
+
+
+def _unused(name: str, taken: Iterable[Path]) -> str:
+    """A file name from ``name`` that none of ``taken`` has, also where capitals do not count."""
+    name = re.sub(r"[^\w.-]", "_", name)
+    names = {path.name.lower() for path in taken}
+    stem, dot, ending = name.rpartition(".")
+    while name.lower() in names:
+        stem += "_"
+        name = f"{stem}{dot}{ending}"
+    return name

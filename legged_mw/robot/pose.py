@@ -109,13 +109,10 @@ class Judged(NamedTuple):
         return "; ".join(self.faults) or "no fault"
 
 
-def judge_poses(
-    robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole], maker: Maker | None, keyframe: bool
-) -> list[Judged]:
-    """All candidates, the chosen one first. ``neutral`` (D,): all joints at 0 or at the nearest end of their range.
-
-    ``keyframe``: whether ``robot.pose`` is that of the file's keyframe.
-    """
+def judge_poses(robot: RobotModel, feet: Sequence[Sole], maker: Maker | None, keyframe: bool) -> list[Judged]:
+    """All candidates, the chosen one first. ``keyframe``: whether ``robot.pose`` is that of the file's keyframe."""
+    zero = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
+    neutral = hang_arms(robot, zero, feet)
     feet = [_whole(robot.physics, neutral, foot) for foot in feet]
     legs = find_legs(robot, neutral, feet)
     candidates = []
@@ -126,7 +123,7 @@ def judge_poses(
         angles = [said.get(name, angle) for name, angle in zip(robot.joint_names, neutral, strict=True)]
         candidates.append(Candidate("its maker's", np.array(angles), 1, source=maker.source))
     candidates += crouches(robot, neutral, legs)
-    candidates.append(Candidate("all joints at 0, or at the nearest end of their range", neutral, 3))
+    candidates.append(Candidate("all joints at 0, or at the nearest end of their range", zero, 3))
     judged = [judge(robot, candidate, legs, feet, maker) for candidate in candidates]
     return sorted(judged, key=lambda each: (bool(each.faults), *_order(each)))
 
@@ -280,6 +277,50 @@ def _range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+# ---- arms ----
+
+_BESIDE = 0.03  # [m] a joint further from the middle plane belongs to an arm, not to waist or head
+_LIGHT = 0.005  # of the robot's mass: what a joint of a finger carries
+_STAY = 0.01  # [m] of height: what a radian away from 0 costs, so that idle joints stay there
+
+
+def walking_joints(model: mujoco.MjModel, feet: Sequence[Sole]) -> set[int]:
+    """Places in (D,) of the joints between the root and a foot, without those that carry all feet, a waist's."""
+    legs = [{joint - 1 for joint in joints_to(model, foot)} for foot in feet]
+    return set.union(*legs) - (set.intersection(*legs) if len(legs) > 1 else set())
+
+
+def hang_arms(robot: RobotModel, zero: FloatArray, feet: Sequence[Sole]) -> FloatArray:
+    """``zero`` (D,) with the arms as their weight would have them. Waist, head and fingers stay."""
+    model, angles, total = robot.physics, zero.copy(), float(robot.physics.body_subtreemass[0])
+    data, walking = posed(model, zero), walking_joints(model, feet)
+    arms = [
+        joint
+        for joint in range(1, model.njnt)
+        if joint - 1 not in walking
+        and abs(data.xanchor[joint][1] - data.qpos[1]) > _BESIDE
+        and model.body_subtreemass[model.jnt_bodyid[joint]] > _LIGHT * total
+    ]
+    for _ in range(2):  # an elbow changes what a shoulder carries
+        for joint in arms:
+            low, high = _range(model, joint)
+            options = np.unique([zero[joint - 1], *np.linspace(low + _MARGIN, high - _MARGIN, 61)])
+            costs = [
+                _height_of(model, angles, joint, option) + _STAY * abs(option - zero[joint - 1]) for option in options
+            ]
+            angles[joint - 1] = options[int(np.argmin(costs))]
+    return angles.round(2)
+
+
+def _height_of(model: mujoco.MjModel, angles: FloatArray, joint: int, angle: float) -> float:
+    """The height [m] of the centre of mass of what the joint carries, with the joint at ``angle`` [rad]."""
+    trial = angles.copy()
+    trial[joint - 1] = angle
+    data = posed(model, trial)
+    mujoco.mj_comPos(model, data)
+    return float(data.subtree_com[model.jnt_bodyid[joint], 2])
+
+
 # ---- crouches ----
 
 
@@ -424,7 +465,7 @@ def _sag(
         mujoco.mj_jac(model, data, jacobian, None, place, int(model.geom(foot.geoms[0]).bodyid[0]))
         torque -= jacobian[2] * force
     known = maker.of("kp", names) if maker else {}
-    walking = sorted({joint - 1 for foot in feet for joint in joints_to(model, foot)})
+    walking = sorted(walking_joints(model, feet))
     stiffness = {i: known.get(names[i]) or float(robot.effort_range[i, 1]) for i in walking}
     sags = {i: abs(float(torque[6 + i])) / stiffness[i] for i in walking if stiffness[i] > 0.0}
     if not sags:

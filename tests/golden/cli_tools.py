@@ -69,7 +69,5 @@ def table() -> Table:
         made.programs(name, lines)
     made.programs("doctor", ["--x"])
     made.calls({"no program": legged_mw, "no such program": lambda: legged_mw("trian")})
-    made.add(
-        "robot to a folder that is a file", lambda root: new.write(None, GO1, "a", root / "there.xml", True, False)
-    )  # type: ignore[arg-type]
+    made.add("robot to a folder that is a file", lambda root: new.write(None, GO1, "a", root / "there.xml", force=True))  # type: ignore[arg-type]
     return made
