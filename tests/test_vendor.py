@@ -571,10 +571,16 @@ def test_inertias_that_all_come_from_geoms_do(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "place",
-    ["meshes/leg.stl", "../mini_description/meshes/leg.stl", "../../mini_description/meshes/leg.stl", "leg.stl"],
+    [
+        "meshes/leg.stl",
+        "../mini_description/meshes/leg.stl",
+        "../../mini_description/meshes/leg.stl",
+        "leg.stl",
+        "../../../meshes/leg.stl",
+    ],
 )
 def test_package_paths_are_found_near_the_file(tmp_path: Path, place: str) -> None:
-    file = tmp_path / "a/b/mini.urdf"
+    file = tmp_path / "a/b/c/mini.urdf"
     brick((file.parent / place).resolve())
     names = "package://mini_description/meshes/leg.stl"
     robot = build(urdf(file, leg=part("collision", names) + part("visual", names)))

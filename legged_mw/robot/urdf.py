@@ -144,7 +144,8 @@ def _resolve(asked: str, file: Path, meshdir: str) -> Path:
     places = [folder / inside for folder in above if folder.name == package] + [
         folder / package / inside for folder in above
     ]
-    places += [folder / inside for folder in above[:3]] + [here / meshdir / inside, here / name, here / "meshes" / name]
+    # the package may lie in a folder of another name
+    places += [folder / inside for folder in above[:5]] + [here / meshdir / inside, here / name, here / "meshes" / name]
     return next((place for place in places if place.is_file()), here / inside)
 
 

@@ -130,8 +130,7 @@ def build_model(
         fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
         add_ground(spec, ground, notes)
-        _set_collisions(spec, names.find(colliders, "colliders", colliding=True), self_collisions, notes)
-        notes += names.passed_over(colliders)
+        _set_collisions(spec, names, colliders, self_collisions, notes)
         if self_collisions:
             _leave_out_neighbours(spec, posed.angles, notes)
         speeds = set_machine(robot, partial, posed, drive)
@@ -215,8 +214,12 @@ def _option(name: str, value: float) -> str:
     return " ".join(word.split("_")[1].lower() for word in fits) or "none"
 
 
-def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, notes: list[str]) -> None:
+def _set_collisions(
+    spec: mujoco.MjSpec, names: GeomNames, patterns: Sequence[str], self_collisions: bool, notes: list[str]
+) -> None:
     """The ground is contype 1 and colliders have conaffinity 1; with self-collisions colliders have bit 2 in both."""
+    colliders = names.find(patterns, "colliders", colliding=True)
+    notes += names.passed_over(patterns)
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
     off = []
     for geom in robot:
