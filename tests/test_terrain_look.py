@@ -150,6 +150,7 @@ def test_flat_ground_lies_all_around_as_far_as_a_camera_sees(levels: int, column
     )
     away = np.abs(grid[:, :, None] - model.geom_pos[pieces, :2]) <= model.geom_size[pieces, :2]
     tiles = (np.abs(grid) <= [x, y]).all(axis=-1)
+    assert not model.geom_pos[pieces, 2].any()  # at the height of the tiles' rims
     assert (away.all(axis=-1).sum(axis=-1) == ~tiles).all(), "one piece everywhere beside the tiles, none over them"
 
 
