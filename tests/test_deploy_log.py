@@ -146,6 +146,7 @@ def test_a_disk_that_hangs_costs_steps_of_the_log_alone(
     assert len(found.rows["time"]) in (200, 300) and found.events[-1][1].endswith(
         " steps were not logged: the disk is too slow"
     )
+    assert found.events[-1][0] == pytest.approx(18.0)  # [s] the first step of the last block of 100 that was lost
 
 
 @contextmanager

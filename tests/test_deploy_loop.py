@@ -68,7 +68,8 @@ def test_real_time_priority_is_given_back_as_a_user_may(monkeypatch: pytest.Monk
     """Linux lets only root take back the flag that threads do not inherit the priority."""
     asked: list[int] = []
 
-    def schedule(_: int, policy: int, parameters: Any) -> None:
+    def schedule(process: int, policy: int, parameters: Any) -> None:
+        assert process == 0  # this thread
         if asked and not policy & os.SCHED_RESET_ON_FORK:
             raise PermissionError(1, "Operation not permitted")
         asked.append(policy)

@@ -319,6 +319,21 @@ def test_pause_stands_still_and_slow_motion_takes_longer() -> None:
     assert session._pace.dt == pytest.approx(0.02 / 0.25)  # of real time a step
 
 
+def test_pace_and_mean_velocity_of_a_segment_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
+    pilot = Pilot(THREE)
+    session = Session(FakeStage(1), FakeViewer(pilot), pilot)
+    # 100 steps of 0.02 s within 4 s
+    session.steps, session._measured = 150, (10.0, 50, 0.0)
+    monkeypatch.setattr("legged_mw.view.session.time.perf_counter", lambda: 14.0)
+    assert session._tempo() == ", x 0.50"
+    # a segment of more than 2 s leaves out its first second
+    session._since, session._followed = 0.0, np.zeros(3)
+    for steps in (100, 101):
+        session._velocities = [np.zeros(3)] * 50 + [np.ones(3)] * (steps - 50)
+        session._end_segment()
+    assert [segment.velocity[0] for segment in session._segments] == [0.5, 1.0]
+
+
 def test_falls_are_counted_once_and_shown_for_a_while() -> None:
     stage, pilot = FakeStage(2, falls={3: 1, 4: 1, 50: 0}), Pilot(THREE, 2)
     viewer = FakeViewer(pilot)

@@ -26,6 +26,7 @@ from legged_mw.robot.measure import (
     beyond_euler,
     family,
     inside_by,
+    mass_matrices,
     measure,
     suggest,
     tilt,
@@ -90,6 +91,15 @@ def test_a_robot_of_one_joint(tmp_path: Path) -> None:
     assert found.room[:2] == (8, 1 + 16)  # contacts: at least 8; rows: a limit and four contacts
     assert found.stand.end == "stands" and found.mode.growth == pytest.approx(1.0, abs=1e-6)
     assert joint.torque == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_joint_without_limits_is_looked_at_within_one_radian(tmp_path: Path) -> None:
+    robot, pose = wheel(tmp_path, offset=0.1), np.array([0.3])
+    limited = mass_matrices(robot, pose)
+    robot.physics.jnt_limited[:] = 0
+    for matrices, low, middle, high in ((limited, -2.0, 0.0, 2.0), (mass_matrices(robot, pose), -0.7, 0.3, 1.3)):
+        for name, angle in {"default": 0.3, "low": low, "middle": middle, "high": high}.items():
+            np.testing.assert_allclose(matrices[name], mass_matrices(robot, np.array([angle]))["default"])
 
 
 def test_sag_is_the_torque_at_rest_over_kp(tmp_path: Path) -> None:
@@ -166,6 +176,9 @@ def test_inside_by() -> None:
     square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [1.0, 1.0], [1.0, 0.0]])
     assert inside_by(square, np.array([1.0, 0.5])) == pytest.approx(0.5)
     assert inside_by(square, np.array([3.0, 3.0])) == pytest.approx(-math.sqrt(2.0))
+    triangle = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])
+    assert inside_by(triangle, np.array([1.5, 1.0])) == pytest.approx(0.7)  # of 3 x + 4 y = 12
+    assert inside_by(triangle, np.array([4.0, 3.0])) == pytest.approx(-2.4)
     assert inside_by(square[:2], np.array([1.0, 0.25])) == pytest.approx(-0.25)  # two points span a line
     assert inside_by(square[:1], np.array([0.0, 1.0])) == pytest.approx(-1.0)
     assert inside_by(square[:0], np.zeros(2)) == -math.inf

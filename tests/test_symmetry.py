@@ -22,7 +22,7 @@ from legged_mw.envs.observations import Row
 from legged_mw.rl.learner_config import rsl_rl_config
 from legged_mw.rl.ppo import mirror
 from legged_mw.rl.run_folder import update_from_run
-from legged_mw.sim.mirror import find_partners
+from legged_mw.sim.mirror import find_partners, opposites
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import LoadedTask, load_task
@@ -73,6 +73,9 @@ def test_go1_pairs_right_with_left(env: LeggedRobot) -> None:
     assert [FEET[i] for i in partners.sites] == ["FL", "FR", "RL", "RR"]
     assert find_partners(env.robot, ["head", "RL", "RR"]).sites == (0, 2, 1)  # the head is in the middle
     assert find_partners(env.robot).sites == ()
+    # a site and a geom, a body, and the first site, in the middle
+    for name, image in {"FR": "FL", "FR_calf": "FL_calf", "head": "head"}.items():
+        assert opposites(env.robot, name) == [image]
 
 
 # A turned root, joints in the middle, three at one place, slides, inclined axes, and a pair whose axes point opposite ways.

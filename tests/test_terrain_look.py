@@ -19,7 +19,7 @@ from program import run
 from benchmarks import terrain_picture
 from legged_mw import ROOT
 from legged_mw.drawing.scene import ground_model, visual_model, visual_spec
-from legged_mw.drawing.terrain_look import relief
+from legged_mw.drawing.terrain_look import _slopes, relief
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.task import load_task
@@ -87,6 +87,11 @@ def test_edges_are_light_and_risers_dark() -> None:
     assert riser < lower < level < upper
 
 
+def test_the_slope_of_a_cell_is_its_largest_step() -> None:
+    heights = np.array([[0.0, 0.0, 0.0], [0.0, 5.0, 7.0], [0.0, 1.0, 1.0]], dtype=np.float32)
+    assert _slopes(heights).tolist() == [[5.0, 7.0], [5.0, 6.0]]
+
+
 def test_squares_of_half_a_metre_and_lines_around_tiles() -> None:
     ground = terrain("flat", levels=2)
     tone = relief(ground)[..., 1].astype(int)
@@ -150,6 +155,7 @@ def test_flat_ground_lies_all_around_as_far_as_a_camera_sees(levels: int, column
     )
     away = np.abs(grid[:, :, None] - model.geom_pos[pieces, :2]) <= model.geom_size[pieces, :2]
     tiles = (np.abs(grid) <= [x, y]).all(axis=-1)
+    assert not model.geom_pos[pieces, 2].any()  # at the height of the tiles' rims
     assert (away.all(axis=-1).sum(axis=-1) == ~tiles).all(), "one piece everywhere beside the tiles, none over them"
 
 

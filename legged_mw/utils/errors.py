@@ -9,6 +9,7 @@ import sysconfig
 import traceback
 import unicodedata
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -82,6 +83,7 @@ def place_of(method: Any) -> str:
     return line_of(function.__code__, function.__code__.co_firstlineno)
 
 
+@cache
 def is_library(module: str, file: str) -> bool:
     """Whether code belongs to a library, or to the guard that watches the user's code and ours."""
     parts = module.split(".")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
+from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -134,3 +136,19 @@ def test_the_gpu_that_was_asked_for_is_opened(
 
 def test_a_gpu_that_is_not_there_is_not_opened() -> None:
     assert quick_start.open_gpu(99) is False
+
+
+@pytest.mark.parametrize("gpus", [3, 2])
+def test_a_gpu_is_opened_by_three_calls_of_the_driver(gpus: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """0 is success. A call that fails, here of the third GPU of two, is the last."""
+    asked = list[tuple[str, object]]()
+
+    def call(name: str, result: int = 0) -> Callable[..., int]:
+        return lambda *args: asked.append((name, args[-1])) or result
+
+    driver = SimpleNamespace(
+        cuInit=call("init"), cuDeviceGet=call("get", 0 if gpus > 2 else 101), cuDevicePrimaryCtxRetain=call("retain")
+    )
+    monkeypatch.setattr(quick_start.ctypes, "CDLL", lambda _: driver)
+    assert quick_start.open_gpu(2) is (gpus > 2)
+    assert asked[:2] == [("init", 0), ("get", 2)] and len(asked) == gpus
