@@ -193,6 +193,25 @@ def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: boo
     return data
 
 
+def _corners(points: FloatArray) -> FloatArray:
+    """The corners (C, 2) of the convex hull of ``points`` (P, 2): Andrew's monotone chain."""
+    ordered = np.unique(points, axis=0)
+    found = list[FloatArray]()
+    for side in (ordered, ordered[::-1]):
+        chain = list[FloatArray]()
+        for point in side:
+            while len(chain) > 1 and _turn(chain[-2], chain[-1], point) <= 0.0:
+                chain.pop()
+            chain.append(point)
+        found += chain[:-1]
+    return np.array(found or [points[0]])
+
+
+def _turn(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
+    """Positive where the way from a over b to c, (2,) each, turns to the left."""
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
 def inside_by(points: FloatArray, place: FloatArray) -> float:
     """The distance [m] of ``place`` (2,) to the edge of the convex hull of ``points`` (P, 2) [m]; negative if outside.
 
@@ -201,7 +220,7 @@ def inside_by(points: FloatArray, place: FloatArray) -> float:
     """
     if not len(points):
         return -math.inf
-    away = points - place
+    away = (_corners(points) if len(points) > 32 else points) - place  # a mesh on the ground has thousands of pairs
     ways = np.concatenate([(away[:, None] - away[None]).reshape(-1, 2) @ [[0.0, 1.0], [-1.0, 0.0]], -away])
     lengths = np.linalg.norm(ways, axis=1)
     ways = ways[lengths > 1e-9] / lengths[lengths > 1e-9, None]
