@@ -63,6 +63,12 @@ def test_double_support_and_a_limp() -> None:
     assert found["duty_left_right"] == pytest.approx(0.25) and found["all_down"] == pytest.approx(0.25)
 
 
+def test_a_hop_leaves_no_foot_down() -> None:
+    """Both feet stand for the first 0.7 s of each second."""
+    found = looks(walk(force=50.0 * np.stack([TIME % 1.0 < 0.7] * 2, axis=1)))
+    assert found["none_down"] == pytest.approx(0.3) and found["all_down"] == pytest.approx(0.7)
+
+
 def test_chatter_is_no_step() -> None:
     force = np.where((TIME % 1.0 < 0.5)[:, None] == np.array([True, False]), 100.0, 0.0)
     force[100:110, 0] = 0.0  # 20 ms in the air
