@@ -69,7 +69,8 @@ _COMMENTS = {
     "delay_ms": "[ms] from an action to its torque",
     "dof_acc": "no jerks",
     "feet_impact_vel": "no stamping",
-    "pose": "arms and waist quiet",
+    "target_limits": "no targets beyond a joint's range",
+    "max_push_ang_vel": "[rad/s] a push turns it too",
     "feet_orientation": "soles level",
     "energy": "by its mass",
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
@@ -210,9 +211,10 @@ def _learner(found: Draft, train: str) -> list[str]:
         "        overrides = {",
         '            "commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',
     ]
+    lines.append(f"            {off},")
     if len(found.feet) == 2:
-        off += ', "actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0]'
-    return [*lines, f"            {off},", "        }"]
+        lines.append('            "actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0],')
+    return [*lines, "        }"]
 
 
 def _before_a_real_robot(found: Draft) -> str:
