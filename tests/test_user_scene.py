@@ -144,30 +144,42 @@ def with_include(name: str) -> Change:
     return change
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (renamed, ["no joint 'FL_calf_joint'", "FL_knee_joint"]),
-        (with_a_tail, ["does not move", "tail_joint"]),
-        (with_a_ball, ["one free joint", "ball"]),
-        (with_time("0.003"), ["time step of 0.003 s", "0.02 s"]),
-        (with_time("0.05"), ["time step of 0.05 s"]),
-        (with_include("../secret.xml"), ["outside of its own folder"]),
-        (with_include("/etc/passwd"), ["outside of its own folder"]),
-        (lambda root: root.iter("geom").__next__().set("size", "nan"), ["not a number"]),
-    ],
-)
-def test_a_scene_that_does_not_fit(change: Change, words: list[str], tmp_path: Path) -> None:
-    with pytest.raises(UserError) as caught:
+def without_feet(root: ElementTree.Element) -> None:
+    for calf in [body for body in root.iter("body") if body.get("name") == "FL_calf"]:
+        for body in calf.iter("body"):
+            for geom in body.findall("geom"):
+                body.remove(geom)
+
+
+# each is refused in the line that tests/golden/errors.txt has
+WRONG: dict[str, Change] = {
+    "a joint of another name": renamed,
+    "a joint more": with_a_tail,
+    "a second free body": with_a_ball,
+    "a time step that is no share of the period": with_time("0.003"),
+    "a time step above the period": with_time("0.05"),
+    "a file above": with_include("../secret.xml"),
+    "a file elsewhere": with_include("/etc/passwd"),
+    "a size of NaN": lambda root: root.iter("geom").__next__().set("size", "nan"),
+    "no foot": without_feet,
+}
+NO_SCENES = {
+    "an empty file": "",
+    "no XML": "no xml",
+    "a URDF": "<robot name='a'/>",
+    "a DOCTYPE": "<!DOCTYPE a><mujoco/>",
+    "nothing in it": "<mujoco/>",
+}
+
+
+@pytest.mark.parametrize("change", WRONG.values(), ids=WRONG)
+def test_a_scene_that_does_not_fit(change: Change, tmp_path: Path) -> None:
+    with pytest.raises(UserError):
         fit(vendors(tmp_path, change), GO2, read_contract(GO2), lowest_point)
-    line = str(caught.value)
-    assert line.startswith("--scene: ") and "\n" not in line and all(word in line for word in words), line
 
 
-@pytest.mark.parametrize("text", ["", "no xml", "<robot name='a'/>", "<!DOCTYPE a><mujoco/>", "<mujoco/>"])
-def test_what_is_no_scene(text: str, tmp_path: Path) -> None:
-    (tmp_path / "a.xml").write_text(text)
-    for file in (tmp_path / "a.xml", tmp_path, tmp_path / "none.xml"):
+def test_what_is_no_scene(tmp_path: Path) -> None:
+    for file in (tmp_path, tmp_path / "none.xml"):
         with pytest.raises(UserError):
             fit(file, GO2, read_contract(GO2), lowest_point)
     os.mkfifo(tmp_path / "pipe.xml")

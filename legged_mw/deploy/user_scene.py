@@ -33,7 +33,9 @@ def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[m
     if not file.is_file():
         raise UserError(f"--scene: no file {file}")
     if contract.motors.law != "servo":
-        raise UserError(f"--scene: the policy drives motors of the law '{contract.motors.law}'; a scene gets servos")
+        raise UserError(
+            f"--scene: in a scene every joint gets a servo, but the policy drives motors of the law '{contract.motors.law}': leave it out"
+        )
     try:
         source = XmlSource(file)
         if source.root.tag != "mujoco":
@@ -72,7 +74,9 @@ def _in_scene(
             f'{contract.period:g} s; write one in it: <option timestep="{contract.timestep:g}"/>'
         )
     kept = {row.name: row.sensors for row in contract.rows if row.sensors}
-    names = [model.sensor(i).name for i in range(model.nsensor)]
+    names = [
+        name for i in range(model.nsensor) if not (name := model.sensor(i).name).startswith(("deploy/", "contact/"))
+    ]
     for row, wanted in kept.items():
         for name in wanted:
             if name not in names:
@@ -112,7 +116,9 @@ def _find_joints(spec: mujoco.MjSpec, file: Path, contract: Contract) -> None:
         if name not in names:
             raise UserError(f"--scene: {unknown('joint', name, names, file.name)}")
     if others := [name or "one without a name" for name in names if name not in contract.joints]:
-        raise UserError(f"--scene: {file.name} has joints that the policy does not move: {', '.join(others)}")
+        raise UserError(
+            f"--scene: {file.name} has joints that the policy does not move: {', '.join(others)}; take them out of a copy of it"
+        )
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     root = _root(spec, contract)
     if [joint.parent.name for joint in free] != [root.name] or root.parent.name != "world":
