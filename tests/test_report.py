@@ -207,16 +207,13 @@ def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
     assert "does not walk<" in html and "does not beat the peer" in html
 
 
-def test_json_holds_every_figure_and_pictures_are_there(pages: Path, both: tuple[dict[str, Any], ...]) -> None:
+def test_json_holds_every_figure(pages: Path, both: tuple[dict[str, Any], ...]) -> None:
     _, result, figures = both
     saved = json.loads((pages / "report.json").read_text())
     first, numpy, rival = saved["columns"]
     assert first["exam"] == json.loads(json.dumps(result)) and first["figures"] == json.loads(json.dumps(figures))
     assert numpy["name"] == "by numpy" and numpy["figures"] is None and rival["exam"]["falls"] == 22
     assert saved["task"] == "go1_flat" and saved["peer"] == PEERS["go1"][0].figures and len(saved["peers"]) == 1
-    names = {"tracking", "steps", "gait", "joints", "motors", "pushes", "energy", "reward"}
-    assert {path.stem for path in pages.glob("*.png")} == names
-    assert all(path.stat().st_size > 5000 and path.read_bytes().startswith(b"\x89PNG") for path in pages.glob("*.png"))
 
 
 def test_a_task_without_a_peer(both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:
@@ -262,7 +259,7 @@ def test_several_peers_are_their_best_and_a_table(
     assert row + "<td>0.002</td><td>0.63</td><td>100, 69, 12, 6, 0, 0, 0, 0</td><td>0.25</td></tr>" in table
     assert table.count("<tr>") == 1 + 1 + 10 and "<tr><th>mine</th><td>0</td>" in table
     assert len(saved["peers"]) == 10 and saved["peer"]["cost_of_transport"] == 0.3
-    assert {path.stem for path in tmp_path.glob("*.png")} == {"pushes", "energy"} and html.count("best of 10") == 1 + 2
+    assert html.count("best of 10") == 1 + 2
 
 
 def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...]) -> None:

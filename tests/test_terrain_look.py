@@ -1,27 +1,22 @@
-"""Rough ground as it is drawn: what the picture on it shows, where it lies, what is drawn coarsely, and the picture of all tiles."""
+"""Rough ground as it is drawn: what the picture on it shows, where it lies and what is drawn coarsely."""
 
 from __future__ import annotations
 
 import shlex
-import sys
 from contextlib import closing
-from pathlib import Path
 
 import legged_mw  # noqa: F401  (sets MUJOCO_GL, which mujoco reads when it is imported)
 
 # isort: split
-import av
 import mujoco
 import numpy as np
 import pytest
 from program import run
 
-from benchmarks import terrain_picture
 from legged_mw import ROOT
 from legged_mw.drawing.scene import ground_model, visual_model, visual_spec
 from legged_mw.drawing.terrain_look import _slopes, relief
 from legged_mw.sim.terrain import Terrain, make_terrain
-from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.task import load_task
 from legged_mw.view.camera import ELEVATION, RobotCamera
 from legged_mw.view.playing import ground_to_watch
@@ -268,84 +263,3 @@ def test_a_plane_stays_one() -> None:
     assert ground_to_watch(task) == {}
     task.set("terrain.mesh_type", "heightfield")
     assert ground_to_watch(task)["terrain.num_rows"] == 3
-
-
-# ---- the picture of all tiles
-
-
-def draw(monkeypatch: pytest.MonkeyPatch, *args: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["terrain_picture", *args])
-    with one_line_errors(terrain_picture.PROGRAM):
-        terrain_picture.main()
-
-
-def test_the_picture_of_all_tiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(terrain_picture, "WIDTH", 640)
-    kinds = "terrain.terrain_proportions={stairs_up:1, flat:1}"
-    draw(
-        monkeypatch,
-        str(tmp_path / "g.png"),
-        "--set",
-        "terrain.num_rows=3",
-        "--set",
-        kinds,
-        "--set",
-        "terrain.horizontal_scale=0.1",
-    )
-    assert capsys.readouterr().out.startswith("written to ")
-    with av.open(str(tmp_path / "g.png")) as container:
-        frame = next(container.decode(video=0)).to_ndarray(format="rgb24")
-    assert frame.shape[1] == 640
-    names = frame[:, : int(0.2 * 640)] > 230
-    lines = np.flatnonzero(names.any(axis=(1, 2)))
-    difficulty, stairs_up, flat_ = (len(block) for block in np.split(lines, np.flatnonzero(np.diff(lines) > 3) + 1))
-    assert stairs_up > 1.5 * max(difficulty, flat_), "its name, and under it its measure"
-    stairs, flat = (
-        frame[part, 300:, 1].std() for part in (slice(40, frame.shape[0] // 2), slice(frame.shape[0] // 2 + 30, -20))
-    )
-    assert stairs > 2 * flat
-
-
-def blocks(ink: np.ndarray, gap: int) -> int:
-    """How many there are of True, more than ``gap`` apart."""
-    return int((np.diff(np.flatnonzero(ink)) > gap).sum()) + 1
-
-
-@pytest.mark.parametrize(
-    ("levels", "kinds", "size", "numbers", "lines"),
-    [
-        (1, [*KINDS, "gap"], (1280, 667), 1, 6),  # no higher
-        (20, ["stairs_up", "flat"], (156, 1692), 20, 4),  # wider, so that a name and its measure have room
-        (40, ["stairs_up", "flat"], (140, 2560), 40, 3),  # a name alone
-        (100, ["stairs_up", "flat"], (96, 2560), 34, 2),  # every third number, and one name
-    ],
-)
-def test_names_do_not_run_into_each_other(
-    levels: int, kinds: list[str], size: tuple[int, int], numbers: int, lines: int
-) -> None:
-    frame = terrain_picture.picture(terrain(*kinds, levels=levels, cell=1.0))
-    assert frame.shape[:2] == pytest.approx(size, abs=8)
-    ink = (frame > 230).all(axis=2)
-    assert blocks(ink[:26, 280:].any(axis=0), 8) == numbers
-    assert blocks(ink[:, :200].any(axis=1), 8 if levels == 1 else 1) == lines
-
-
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["a.jpg"], "a.jpg: the picture is a PNG; give it a name that ends in .png"),
-        (
-            ["a.png", "--task", "go1_flat"],
-            "go1_flat is on a plane; to see its section terrain all the same add --set terrain.mesh_type=",
-        ),
-    ],
-)
-def test_mistakes_are_one_line(
-    args: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit):
-        draw(monkeypatch, *args)
-    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())

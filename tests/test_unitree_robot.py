@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.unitree import begin
 from legged_mw.deploy.contract import ContractError, ContractRow, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.robot import RobotError, damped
@@ -19,7 +18,7 @@ from legged_mw.unitree.client import UnitreeRobot, check_rows
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
 from legged_mw.unitree.robots import G1, GO2, H1
-from legged_mw.unitree.serve import Faults, SimulatedUnitree
+from legged_mw.unitree.serve import STEP, Faults, SimulatedUnitree
 from tests.wires import POLICIES, Owner, pair
 from tests.wires import domain as domain
 
@@ -412,7 +411,11 @@ def test_a_go2_measures_what_its_feet_touch() -> None:
 
 
 def test_the_exam_over_a_slow_wire_begins(domain: int) -> None:
-    """benchmarks/unitree.py: a reset moves the clock by a second, and the first state since must have arrived."""
+    """A reset moves the clock by a second, and the first state since must have arrived."""
     both = pair("go2_flat", domain, faults=Faults(delay_ms=10.0, jitter_ms=2.0), hoist=False)
-    begin(both.sim, both.robot)
+    both.sim.reset(after=1.0)
+    both.sim.step()
+    both.robot.write(both.contract.default_pose)
+    for _ in range(round(both.contract.period / STEP)):
+        both.sim.step()
     np.testing.assert_allclose(both.robot.read().joint_pos, both.contract.default_pose, atol=0.1)

@@ -23,7 +23,6 @@ from legged_mw.rl import learner_config
 from legged_mw.utils.bounds import bounds_text
 from legged_mw.utils.config import Config, field_types, type_text
 from legged_mw.utils.task import load_task
-from website.formula import formula
 
 UNITS = {*["m", "rad", "s", "ms", "N", "kg", "W", "deg", "mm", "Hz", "pixel", "iterations"], "-", ""}
 TERMS: dict[str, str] = {  # a class with terms of its own -> heading; others come after these, by their names
@@ -131,6 +130,13 @@ def terms_of(owner: type) -> dict[str, Any]:
     return {name.removeprefix("_reward_"): term for name, term in vars(owner).items() if name.startswith("_reward_")}
 
 
+def body(term: Any) -> str:
+    """What ``term`` does, statement by statement, without its docstring."""
+    [function] = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(term)))).body
+    assert isinstance(function, ast.FunctionDef)
+    return re.sub(r"\s+", " ", "; ".join(map(ast.unparse, function.body[1:]))).replace("self.", "")
+
+
 def rewards() -> str:
     """All terms by the class that has them, then their scales in the tasks that ship."""
     parts = []
@@ -142,7 +148,7 @@ def rewards() -> str:
                 [
                     code(name),
                     cell(said.words),
-                    code(formula(term)),
+                    code(body(term)),
                     cell(said.unit) or "1",
                     cell(said.source),
                     default_scale(owner, name),
@@ -150,7 +156,7 @@ def rewards() -> str:
             )
         parts += [
             f"### {heading}",
-            table(["term", "what it measures", "formula", "unit", "source", "default scale"], rows),
+            table(["term", "what it measures", "code", "unit", "source", "default scale"], rows),
         ]
     return "\n\n".join([*parts, "### Scales in the tasks", _scales()])
 

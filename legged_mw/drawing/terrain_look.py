@@ -147,7 +147,7 @@ def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> N
     add_squares(spec, AROUND, *(COLOUR * (1 + share * squares) for share in (-CHECKER, CHECKER, LINE)))
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "contype": 0, "conaffinity": 0, "castshadow": False}
     x, y = 0.5 * terrain.levels * terrain.tile, 0.5 * len(terrain.kinds) * terrain.tile
-    reach = max(REACH, 2 * x, 2 * y)  # benchmarks/terrain_picture.py sees up to the length of the tiles
+    reach = max(REACH, 2 * x, 2 * y)  # a picture of all tiles sees up to their length
     # [m] along x and y: a side of the tiles, plus the reach beyond its end
     wide, deep = (2 * x + reach, reach), (reach, 2 * y + reach)
     vanes = ((-x, y), (1, 1), wide), ((x, y), (1, -1), deep), ((x, -y), (-1, -1), wide), ((-x, -y), (-1, 1), deep)

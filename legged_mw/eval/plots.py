@@ -1,7 +1,7 @@
-"""Draw the report's figures with matplotlib: each panel as an inline SVG, each section as a PNG. Computes no numbers.
+"""Draw the report's figures with matplotlib, each panel as an inline SVG. Computes no numbers.
 
-Every panel is a function of an Axes, so both formats show the same. In an SVG the colours become CSS variables, and
-the page sets them for light and dark mode. The palette of Okabe and Ito is safe for colour-blind readers.
+Every panel is a function of an Axes. The colours become CSS variables, and the page sets them for light and dark
+mode. The palette of Okabe and Ito is safe for colour-blind readers.
 """
 
 from __future__ import annotations
@@ -12,13 +12,11 @@ import re
 from collections.abc import Callable
 from functools import partial
 from itertools import zip_longest
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -87,7 +85,7 @@ class PlotPanel(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A group of panels: one PNG, and one section of the page."""
+    """A group of panels: one section of the page."""
 
     name: str
     title: str
@@ -149,20 +147,6 @@ def _inline(svg: str) -> str:
     for colour, name in VARIABLES.items():
         svg = svg.replace(colour, f"var(--{name})")
     return re.sub(r"(\.\d\d)\d+", r"\1", svg)  # round coordinates to a hundredth of a point
-
-
-def write_png(section: Section, path: Path) -> None:
-    """Write the section's panels as one PNG on a light background."""
-    across = min(section.across, len(section.panels))
-    rows = math.ceil(len(section.panels) / across)
-    width, height = section.panels[0].width, max(panel.height for panel in section.panels)
-    with rc_context({**STYLE, "figure.facecolor": PAPER}):
-        figure = Figure((across * width, rows * height + 0.4), dpi=130, layout="constrained")
-        figure.suptitle(section.title, x=0.012, ha="left", fontsize=11, fontweight="bold")
-        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.08)  # type: ignore[union-attr]
-        for i, panel in enumerate(section.panels):
-            panel.draw(figure.add_subplot(rows, across, i + 1, projection="polar" if panel.polar else None))
-        FigureCanvasAgg(figure).print_png(path)  # savefig would draw the figure twice
 
 
 def _of(name: str, columns: Columns) -> str:

@@ -346,7 +346,7 @@ def picture(png: bytes, name: str) -> str:
 
 
 def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
-    """Write ``report.json``, one PNG per section and the self-contained ``report.html``.
+    """Write ``report.json`` and the self-contained ``report.html``.
 
     Every column is compared with the first, by the rules of the first. At most two columns have figures.
     """
@@ -362,8 +362,6 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
         content |= {"peer": best_of(asked.peers), "peers": [peer._asdict() for peer in asked.peers]}
     _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
-    for section in sections:
-        plots.write_png(section, folder / f"{section.name}.png")
     _write_text(
         folder / "report.html",
         walking_page(task, asked, columns, [(section, plots.svgs(section)) for section in sections]),

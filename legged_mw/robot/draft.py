@@ -37,7 +37,7 @@ from legged_mw.robot.measure import (
     suggest,
     what_joints_bear,
 )
-from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses, walking_joints
+from legged_mw.robot.pose import SIDEWAYS, Judged, find_wheels, joints_to, judge_poses, walking_joints
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -77,6 +77,7 @@ class Draft(NamedTuple):
     judged: list[Judged]  # the poses that were judged, the chosen one first
     simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
     angles: dict[str, float]  # joint -> default angle [rad], those that are held too
+    wheels: list[str]  # joints that roll, for which a draft has no motor law
 
     @property
     def held(self) -> list[str]:
@@ -121,11 +122,14 @@ def draft(file: Path, simple: bool = False) -> Draft:
     ]
     if held:
         guessed.append(f"held: {', '.join(patterns(held, robot.joint_names))}: {len(held)} joints that do not walk")
+    wheels = find_wheels(robot, np.array(pose))
+    if wheels:
+        guessed.append(f"wheels: {', '.join(wheels)}: without a range, and round about their axis")
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     notes = [*read.notes, *more]
     return Draft(
-        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles
+        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles, wheels
     )
 
 

@@ -135,6 +135,16 @@ def class_name(name: str) -> str:
     return re.sub(r"(?<!\d)_|_(?!\d)", "", capitals)
 
 
+def refuse_wheels(found: Draft, file: Path) -> None:
+    """Raise UserError for a robot on wheels: the servos of a draft turn to an angle, and a wheel turns at a speed."""
+    if found.wheels:
+        raise UserError(
+            f"{shown(file)} is on wheels: {', '.join(found.wheels)} have no range and end in a round collider, and a draft "
+            "has servos that turn to an angle. Write a task that drives wheels by speed (docs/motors.md#wheels), or make "
+            "these joints fixed in a copy of the file: it walks on locked wheels"
+        )
+
+
 def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> str:
     """The text of the config file. LOOK marks values to check."""
     feet = len(found.feet)
