@@ -20,7 +20,7 @@ from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.hard_exam import apply_conditions, look
 from legged_mw.deploy.simulated import lowest_point
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.deploy.user_scene import fit
+from legged_mw.deploy.user_scene import fit, torque_limits
 from legged_mw.eval import hard, walking
 from legged_mw.utils.errors import UserError
 
@@ -30,7 +30,7 @@ Change = Callable[[ElementTree.Element], None]
 
 
 def vendors(folder: Path, change: Change = lambda _: None) -> Path:
-    """A Go2 as a vendor's: torque motors by other names, joints in another order, its own frictions, no sensor, no key."""
+    """A Go2 as a vendor's: torque motors by other names, joints in another order, its own frictions, no sensor."""
     root = ElementTree.parse(GO2 / "scene.xml").getroot()
     for name in ("actuator", "sensor", "keyframe", "size"):
         for element in root.findall(name):
@@ -55,6 +55,8 @@ def vendors(folder: Path, change: Change = lambda _: None) -> Path:
             "motor",
             {"name": f"m_{joint}", "joint": joint, "ctrlrange": f"-{high} {high}", "ctrllimited": "true"},
         )
+    poses = ElementTree.SubElement(root, "keyframe")
+    ElementTree.SubElement(poses, "key", {"name": "home", "ctrl": " ".join(["0"] * 12)})
     change(root)
     file = folder / "vendor.xml"
     ElementTree.ElementTree(root).write(file)
@@ -70,6 +72,7 @@ def test_it_walks_there_as_at_home(tmp_path: Path) -> None:
     assert model.actuator_gainprm[servo, 0] == gain and model.actuator_biasprm[servo, 1] == -gain
     assert model.actuator_forcerange[servo].tolist() == [-45.0, 45.0] and model.nu == 12
     assert model.actuator_biasprm[servo, 2] == -contract.damping[0] and not stage.fleet.damps_by_joint
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     assert model.dof_damping[stage.fleet._dofs].ravel() == pytest.approx(0.1)
     assert all(len(sensors) == 1 for sensors in contract.feet.values())
     command = np.tile([1.0, 0.0, 0.0], (4, 1))
@@ -96,6 +99,25 @@ def test_its_conditions_and_its_looks(tmp_path: Path, monkeypatch: pytest.Monkey
     found = hard.looks(walk)
     assert walk.force.sum(axis=1).mean() / walk.weight == pytest.approx(1.0, abs=0.06)
     assert 2.0 < found["strides"] < 3.0 and found["sole_tilt"] is None
+
+
+def test_joints_without_a_limit_get_the_exports(tmp_path: Path) -> None:
+    """Neither a motor nor the joint states one, but for a calf whose joint does."""
+
+    def without_motors(root: ElementTree.Element) -> None:
+        for name in ("actuator", "keyframe"):
+            for element in root.findall(name):
+                root.remove(element)
+        calf = next(joint for joint in root.iter("joint") if joint.get("name") == "FL_calf_joint")
+        calf.attrib |= {"actuatorfrcrange": "-9 9", "actuatorfrclimited": "true"}
+
+    contract = read_contract(GO2)
+    model = fit(vendors(tmp_path, without_motors), GO2, contract, lowest_point)[0].compile()
+    own = mujoco.MjModel.from_xml_path(str(GO2 / "scene.xml"))
+    found, exported = (torque_limits(each, [each.joint(name).id for name in contract.joints]) for each in (model, own))
+    calf = contract.joints.index("FL_calf_joint")
+    assert found[calf] == 9.0 and np.isfinite(exported).all()
+    assert np.delete(found, calf).tolist() == np.delete(exported, calf).tolist()
 
 
 def test_a_scene_without_a_ground_gets_one(tmp_path: Path) -> None:
