@@ -219,4 +219,8 @@ def test_published_policies_stand_beside_where_they_were_asked_alike() -> None:
     assert hard.beside(faster) == {} == hard.beside(RULES)
     compared = hard.finish(go2, True, result()["conditions"], looks(walk()), 4, 3.0)
     assert compared["peers"] == found and "best of 2" in hard.table(compared)
+    heads, *rows = hard.condition_rows(compared)
+    assert {len(row) for row in rows} == {len(heads)} == {7}
+    assert rows[0][-2:] == ["0.05, 0.03, 0.03", ""] and rows[-1][-1] == "0.88"
+    assert len(hard.condition_rows(result())[0]) == 5
     assert [row.peer for row in hard.figures(compared) if row.peer is not None] == [0.42, 0.62, 0.17, 0.034, 0.002]
