@@ -385,7 +385,7 @@ def condition_rows(result: Mapping[str, Any]) -> list[list[str]]:
     names = ", ".join(name.removesuffix(" rate") for name, _ in AXES)
     rows = [["", "falls", f"error {names}", "drift [m]", f"pushes of {result['push_speed']:g} m/s"]]
     published = result.get("peers")
-    rows[0] += [f"errors of {peer_label(result)}", "their pushes"] if published else []
+    rows[0] += [f"error, {peer_label(result)}", f"pushes, {peer_label(result)}"] if published else []
     for name, each in result["conditions"].items():
         drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
         title = f"{name} of {result['load']:g} kg" if name == "load" else name
