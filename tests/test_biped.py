@@ -184,6 +184,16 @@ def test_attitudes_of_bodies_come_from_the_engine(engine: str) -> None:
     assert not env.sim.xquat[0].any() and env.sim.xquat[1].any()
 
 
+def test_target_limits() -> None:
+    """Soft limits of a Go1's thigh: 1.9075 -+ 0.95 * 2.5935. Targets before the range: 0.9 + 0.5 * 8, 0.9 - 0.5 * 4."""
+    env = make_env(2, {**QUIET, "normalization.clip_actions": 10.0})
+    actions = torch.zeros(2, 12)
+    actions[1, [4, 7]] = torch.tensor([8.0, -4.0])
+    env.actuators.apply(actions)
+    above, below = 4.9 - (1.9075 + 2.463825), (1.9075 - 2.463825) - (0.9 - 2.0)
+    assert term(env, "target_limits") == pytest.approx([0.0, above + below], abs=1e-5)
+
+
 # ---- two legs
 
 

@@ -12,7 +12,6 @@ from worlds import QUIET, changed, make_env, only_scales, snapshot
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.utils.config import ConfigError
 
 DT = 0.02  # [s] a control step
 HAND = {**QUIET, "rewards.tracking_sigma": 0.25}  # what the figures below were worked out for
@@ -170,19 +169,6 @@ def test_settings_reach_the_terms() -> None:
     assert term("feet_height") == pytest.approx([0.0 + (0.08 / 0.12 - 1) ** 2, (0.07 / 0.12 - 1) ** 2])
     # |0.02 - 0.12| sqrt(5) + |0.06 - 0.12| + |0.15 - 0.12| * 0.5
     assert term("feet_clearance")[0] == pytest.approx(0.1 * 5**0.5 + 0.06 + 0.015)
-
-
-def test_target_limits() -> None:
-    """Soft limits of a thigh: 1.9075 -+ 0.95 * 2.5935. Targets before a servo holds them to the range: 0.9 + 0.5 * 8."""
-    env = make_env(2, {**HAND, "normalization.clip_actions": 10.0})
-    actions = torch.zeros(2, 12)
-    actions[1, [4, 7]] = torch.tensor([8.0, -4.0])
-    env.actuators.apply(actions)
-    above, below = 4.9 - (1.9075 + 2.463825), (1.9075 - 2.463825) - (0.9 - 2.0)
-    assert env._reward_target_limits().tolist() == pytest.approx([0.0, above + below], abs=1e-5)
-    with pytest.raises(ConfigError, match="target_limits is on, but actions are no angles"):
-        torques = make_env(1, {**HAND, "control.actuator": "torque", "rewards.scales.target_limits": -1.0})
-        torques._reward_target_limits()
 
 
 def test_moving_is_the_norm_of_all_three_commands() -> None:
