@@ -14,7 +14,7 @@ from legged_mw.robot import new, picture
 from legged_mw.robot.draft import Draft, as_env, draft, has_mirror
 from legged_mw.robot.measure import measure
 from legged_mw.robot.page import few_robots, page
-from legged_mw.robot.pose import as_lines
+from legged_mw.robot.pose import as_lines, why
 from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
@@ -83,11 +83,19 @@ def show(env: RobotTask, title: str, image: Path | None, found: Draft | None = N
     )
     if image is None:
         return
+    poses = None
     try:
         picture.draw(image, robot, health.rest.qpos, feet, title)
+        if found and len(found.judged) > 1:
+            poses = image.with_stem(f"{image.stem}_poses")
+            picture.draw_poses(
+                poses,
+                robot,
+                [(found.stands(each), f"{each.candidate.name}: {why(found.judged[0], each)}") for each in found.judged],
+            )
     except OSError as error:
         raise UserError(f"cannot write {image}: {error.strerror}; say --picture FILE.png") from None
-    print(f"picture: {shown(image)}")
+    print(f"picture: {shown(image)}" + (f"; the judged poses: {shown(poses)}" if poses else ""))
 
 
 if __name__ == "__main__":

@@ -87,6 +87,13 @@ class Draft(NamedTuple):
         """The joints that do not walk."""
         return [name for name in self.angles if name not in self.robot.joint_names]
 
+    def stands(self, judged: Judged) -> NDArray[np.float64]:
+        """The robot in a judged pose (7 + D,), on its feet; held joints stay as they are."""
+        angles = dict(zip(self.angles, judged.candidate.angles, strict=True))
+        return np.array(
+            [0.0, 0.0, judged.height, 1.0, 0.0, 0.0, 0.0, *(angles[name] for name in self.robot.joint_names)]
+        )
+
 
 def draft(file: Path, simple: bool = False) -> Draft:
     """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF)."""

@@ -204,9 +204,7 @@ def _learner(found: Draft, train: str) -> list[str]:
             ]
         return lines
     off = '"domain_rand.enable": False, "perturbation.push": False'
-    lines = [
-        f"    class cpu({train}.cpu):  # on a CPU worlds are alike and nobody pushes: it is to walk within minutes"
-    ]
+    lines = [f"    class cpu({train}.cpu):  # on a CPU worlds are alike and nobody pushes"]
     lines += [
         "        overrides = {",
         '            "commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',

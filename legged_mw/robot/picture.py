@@ -6,6 +6,7 @@ The names stand in columns beside the robot, with lines to their places, so the 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -24,6 +25,7 @@ from legged_mw.view.stage import FloatArray, ViewError
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
 VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]
+ACROSS, LETTERS = 3, 46  # poses side by side; letters of a line above them
 FILL = 0.7  # share of a view's smaller edge for the robot; the names get the rest
 COLLIDER_RGBA, LOOK_ALPHA = (1.0, 0.55, 0.1, 0.42), 0.4
 FOOT_RGBA = (0.0, 0.75, 0.52, 1.0)
@@ -66,6 +68,21 @@ def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Seq
         scene.close()
 
 
+def draw_poses(path: Path, robot: RobotModel, poses: Sequence[tuple[FloatArray, str]]) -> None:
+    """Write a picture of several poses from the left side to ``path`` (PNG): each a ``qpos`` (7 + D,) and a text."""
+    scene, tiles = _Picture(robot, poses[0][0], {}), []
+    try:
+        for qpos, text in poses:
+            scene.posed.pose(qpos)
+            tiles.append(scene.plain(text))
+    finally:
+        scene.close()
+    columns = min(ACROSS, len(tiles))
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
+    save_png(path, np.concatenate(rows))
+
+
 class _Picture:
     """One posed robot, drawn from several sides."""
 
@@ -88,16 +105,7 @@ class _Picture:
 
     def view(self, name: str, azimuth: float, elevation: float, title: str) -> Frame:
         """The robot from one side, with joint names: of the near side in the second view, the others in the first."""
-        camera, model = mujoco.MjvCamera(), self.posed.model
-        camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
-        camera.lookat[:], camera.distance = (
-            self.middle,
-            0.5 * self.size / math.tan(math.radians(model.vis.global_.fovy) / 2) / FILL,
-        )
-        option = mujoco.MjvOption()
-        option.geomgroup[:] = 1
-        option.sitegroup[:] = 0
-        self._renderer.update_scene(self.posed.data, camera, option)
+        camera = self._look(azimuth, elevation)
         joints = self._draw_joints()
         marks = [*self._draw_feet(), *self._draw_imu()]
         near = azimuth == VIEWS[1][1]
@@ -108,6 +116,31 @@ class _Picture:
             for end, rgb in label.arrows:
                 _line(frame, self._project(label.place, camera), self._project(end, camera), rgb, wide=3)
         return frame
+
+    def plain(self, text: str) -> Frame:
+        """The robot from the left side without marks, in half the size, with ``text`` above."""
+        self._look(*VIEWS[1][1:], smaller=1.3)
+        self._renderer.render()
+        context, rect = self._renderer._mjr_context, self._renderer._rect
+        for number, line in enumerate(textwrap.wrap(text, LETTERS)):
+            _text(context, line, 2 * LEFT_COLUMN, 48 + 48 * number, (1.0, 1.0, 1.0), mujoco.mjtFont.mjFONT_BIG)
+        frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(frame, None, rect, context)
+        halves = np.flipud(frame).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3)
+        return halves.mean(axis=(1, 3)).astype(np.uint8)
+
+    def _look(self, azimuth: float, elevation: float, smaller: float = 1.0) -> mujoco.MjvCamera:
+        """Make the scene as seen from these angles [deg]. ``smaller``: so much, with room above."""
+        camera, model = mujoco.MjvCamera(), self.posed.model
+        camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
+        half = math.tan(math.radians(model.vis.global_.fovy) / 2)
+        camera.lookat[:], camera.distance = self.middle, smaller * 0.5 * self.size / half / FILL
+        camera.lookat[2] += 0.6 * (smaller - 1.0) * self.size
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 1
+        option.sitegroup[:] = 0
+        self._renderer.update_scene(self.posed.data, camera, option)
+        return camera
 
     # ---- robot ----
 
@@ -229,11 +262,13 @@ def _width(context: mujoco.MjrContext, text: str) -> int:
     return sum(int(context.charWidth[ord(letter)]) for letter in text if ord(letter) < 127)
 
 
-def _text(context: mujoco.MjrContext, text: str, x: float, y: float, rgb: Rgb) -> None:
+def _text(
+    context: mujoco.MjrContext, text: str, x: float, y: float, rgb: Rgb, font: int = mujoco.mjtFont.mjFONT_NORMAL
+) -> None:
     """Write text with a dark edge. The centre of its first letter is at the pixel (x, y from the top)."""
     for shift, colour in ((1.2, (0.0, 0.0, 0.0)), (0.0, rgb)):
         down = (HEIGHT - y - shift - 6) / HEIGHT
-        mujoco.mjr_text(mujoco.mjtFont.mjFONT_NORMAL, text, context, (x + shift) / WIDTH, down, *colour)
+        mujoco.mjr_text(font, text, context, (x + shift) / WIDTH, down, *colour)
 
 
 def _line(

@@ -518,19 +518,23 @@ def _sag(
 def as_lines(judged: Sequence[Judged]) -> list[str]:
     """A table of all candidates, the chosen one first, and why the others were not chosen."""
     rows = [("pose", "root [m]", "legs", "com [mm]", "sag [rad]", "")]
-    for i, each in enumerate(judged):
-        why = "chosen; " * (i == 0) + (each.verdict if each.faults else "" if i == 0 else _why_not(judged[0], each))
+    for each in judged:
         numbers = f"{each.height:.3f}", f"{100 * each.reach:.0f} %", f"{1e3 * each.margin:+.0f}", f"{each.sag:.2f}"
-        rows.append((each.candidate.name, *numbers, why.removesuffix("; ")))
+        rows.append((each.candidate.name, *numbers, why(judged[0], each)))
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     lines = []
-    for name, *numbers, why in rows:
+    for name, *numbers, said in rows:
         cells = [name.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(numbers, widths[1:], strict=True))]
-        lines.append("  ".join([*cells, why]).rstrip())
+        lines.append("  ".join([*cells, said]).rstrip())
     return lines
 
 
-def _why_not(chosen: Judged, other: Judged) -> str:
+def why(chosen: Judged, other: Judged) -> str:
+    """Why ``other`` is the chosen pose, or why it is not."""
+    if other is chosen:
+        return "; ".join(["chosen", *chosen.faults])
+    if other.faults:
+        return other.verdict
     if other.candidate.rank > chosen.candidate.rank:
-        return "no fault, but nobody stated it"
+        return f"no fault, but {'nobody stated it' if other.candidate.rank > 1 else 'the keyframe comes first'}"
     return f"no fault, but further from a good crouch ({other.off:.1f} against {chosen.off:.1f})"
