@@ -61,6 +61,7 @@ def test_double_support_and_a_limp() -> None:
     force = 50.0 * np.stack([phase < 0.75, phase >= 0.5], axis=1)
     found = looks(walk(force=force))
     assert found["duty_left_right"] == pytest.approx(0.25) and found["all_down"] == pytest.approx(0.25)
+    assert found["none_down"] == 0.0
 
 
 def test_a_hop_leaves_no_foot_down() -> None:

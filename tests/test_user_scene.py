@@ -109,14 +109,14 @@ def test_joints_without_a_limit_get_the_exports(tmp_path: Path) -> None:
             for element in root.findall(name):
                 root.remove(element)
         calf = next(joint for joint in root.iter("joint") if joint.get("name") == "FL_calf_joint")
-        calf.attrib |= {"actuatorfrcrange": "-9 9", "actuatorfrclimited": "true"}
+        calf.attrib |= {"actuatorfrcrange": "-90 90", "actuatorfrclimited": "true"}
 
     contract = read_contract(GO2)
     model = fit(vendors(tmp_path, without_motors), GO2, contract, lowest_point)[0].compile()
     own = mujoco.MjModel.from_xml_path(str(GO2 / "scene.xml"))
     found, exported = (torque_limits(each, [each.joint(name).id for name in contract.joints]) for each in (model, own))
     calf = contract.joints.index("FL_calf_joint")
-    assert found[calf] == 9.0 and np.isfinite(exported).all()
+    assert found[calf] == 90.0 and np.isfinite(exported).all()
     assert np.delete(found, calf).tolist() == np.delete(exported, calf).tolist()
 
 
