@@ -59,7 +59,7 @@ def touch(env: LeggedRobot, *feet: tuple[float, float]) -> None:
 
 def test_every_term_has_a_figure() -> None:
     methods = {name.removeprefix("_reward_") for name in dir(LeggedRobot) if name.startswith("_reward_")}
-    assert methods == {*test_rewards.EXPECTED, *TERMS, *FEET, *test_forces.SCALES}
+    assert methods == {*test_rewards.EXPECTED, "target_limits", *TERMS, *FEET, *test_forces.SCALES}
 
 
 # ---- base and joints
@@ -184,18 +184,28 @@ def test_attitudes_of_bodies_come_from_the_engine(engine: str) -> None:
     assert not env.sim.xquat[0].any() and env.sim.xquat[1].any()
 
 
+def test_target_limits() -> None:
+    """Soft limits of a Go1's thigh: 1.9075 -+ 0.95 * 2.5935. Targets before the range: 0.9 + 0.5 * 8, 0.9 - 0.5 * 4."""
+    env = make_env(2, {**QUIET, "normalization.clip_actions": 10.0})
+    actions = torch.zeros(2, 12)
+    actions[1, [4, 7]] = torch.tensor([8.0, -4.0])
+    env.actuators.apply(actions)
+    above, below = 4.9 - (1.9075 + 2.463825), (1.9075 - 2.463825) - (0.9 - 2.0)
+    assert term(env, "target_limits") == pytest.approx([0.0, above + below], abs=1e-5)
+
+
 # ---- two legs
 
 
 def test_single_stance() -> None:
     """The standing foot's contact time, or the other one's air time, whichever is less."""
-    env = biped({"rewards.max_single_stance": 0.05})
+    env = biped({"rewards.max_single_stance": 0.03})
     env.reset()
     env.commands[:] = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     left_down, both, none, right_down = (1.0, 0.0), (1.0, 1.0), (0.0, 0.0), (0.0, 1.0)
     story = [both, both, left_down, left_down, left_down, both, right_down, none]
     # both in steps 0 and 1: in step 2 the left foot has stood 0.06 s and the right one been in the air for 0.02 s
-    wanted = [0.0, 0.0, 0.02, 0.04, 0.05, 0.0, 0.02, 0.0]  # 0.05: the most that counts
+    wanted = [0.0, 0.0, 0.02, 0.02, 0.0, 0.0, 0.02, 0.0]  # 0.03 pays most, 0.04 as 0.02, 0.06 nothing
     got = []
     for feet in story:
         touch(env, feet, feet)

@@ -360,6 +360,21 @@ def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
     assert torch.equal(walk(plain, 10), walk(make_env(4, QUIET), 10)) and plain.perturbation._push_clock.eq(0).all()
 
 
+def test_a_push_turns_if_it_is_told_so() -> None:
+    """Each axis of the angular velocity, at the moment of the push alone; without it nothing else is drawn."""
+    push = {**QUIET, "perturbation.push": True, "perturbation.push_interval_s": 0.2}
+    plain, turning = (make_env(64, {**push, "perturbation.max_push_ang_vel": most}) for most in (0.0, 0.5))
+    for env in (plain, turning):
+        env.perturbation._push_clock.copy_(torch.arange(64) % 2 + 1.0)
+        torch.manual_seed(3)
+        env.sim.qvel[:, 3:6] = 0.0
+        env.perturbation._push_robots()
+    pushed = torch.arange(64) % 2 == 0
+    assert torch.equal(plain.sim.qvel[:, :2], turning.sim.qvel[:, :2]) and not plain.sim.qvel[:, 3:6].any()
+    assert turning.sim.qvel[pushed, 3:6].abs().amax(dim=0).min() > 0.3 and turning.sim.qvel[:, 3:6].abs().max() <= 0.5
+    assert not turning.sim.qvel[~pushed, 3:6].any()
+
+
 def test_one_field_has_one_writer_under_a_law_in_code_too() -> None:
     """The law has a torque-speed curve, though control.actuator is "servo"."""
 

@@ -61,6 +61,7 @@ def test_double_support_and_a_limp() -> None:
     force = 50.0 * np.stack([phase < 0.75, phase >= 0.5], axis=1)
     found = looks(walk(force=force))
     assert found["duty_left_right"] == pytest.approx(0.25) and found["all_down"] == pytest.approx(0.25)
+    assert found["none_down"] == 0.0
 
 
 def test_a_hop_leaves_no_foot_down() -> None:
@@ -219,4 +220,8 @@ def test_published_policies_stand_beside_where_they_were_asked_alike() -> None:
     assert hard.beside(faster) == {} == hard.beside(RULES)
     compared = hard.finish(go2, True, result()["conditions"], looks(walk()), 4, 3.0)
     assert compared["peers"] == found and "best of 2" in hard.table(compared)
+    heads, *rows = hard.condition_rows(compared)
+    assert {len(row) for row in rows} == {len(heads)} == {7}
+    assert rows[0][-2:] == ["0.05, 0.03, 0.03", ""] and rows[-1][-1] == "0.88"
+    assert len(hard.condition_rows(result())[0]) == 5
     assert [row.peer for row in hard.figures(compared) if row.peer is not None] == [0.42, 0.62, 0.17, 0.034, 0.002]

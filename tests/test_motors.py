@@ -525,3 +525,69 @@ def test_a_network_that_changed_after_training_is_refused(tmp_path: Path) -> Non
     result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", *resumed)
     assert result.code == 0, result.err
     assert load_yaml(folder / "config.yaml")["control"]["network_digest"] == {file: digest(Path(file))} != known
+
+
+# ---- wheels, by a law in code
+
+CAR = """<mujoco><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 0.3"><freejoint/>
+<geom name="trunk" type="box" size="0.3 0.1 0.05" mass="8"/>{}</body></worldbody></mujoco>"""
+STRUT = """<body name="{0}_leg" pos="{1} {2} 0"><joint name="{0}_leg_joint" axis="0 1 0" range="-1 1" actuatorfrcrange="-40 40"/>
+<geom name="{0}_leg" type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.5" contype="0" conaffinity="0"/>
+<body name="{0}_wheel" pos="0 0 -0.2"><joint name="{0}_wheel_joint" axis="0 1 0" actuatorfrcrange="-20 20"/>
+<geom name="{0}" type="cylinder" size="0.1 0.02" zaxis="0 1 0" mass="0.5"/></body></body>"""
+CORNERS = {"FL": (0.25, 0.15), "FR": (0.25, -0.15), "RL": (-0.25, 0.15), "RR": (-0.25, -0.15)}
+
+
+class OnWheels(LeggedRobot):
+    """The class of docs/motors.md."""
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        self.wheels = torch.tensor(["wheel" in name for name in self.robot.joint_names], device=self.device)  # (D,)
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """Legs turn to an angle, wheels turn at a speed: 20 rad/s by an action of 1."""
+        return super()._compute_torques(actions) + self.wheels * self.d_gains * 20.0 * actions
+
+    def _update_state(self) -> None:
+        """The angle of a wheel grows without end: neither policy nor rewards read it."""
+        super()._update_state()
+        self.dof_offset.masked_fill_(self.wheels, 0.0)
+        self.joint_reading.masked_fill_(self.wheels, 0.0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_robot_rolls_on_wheels_that_a_law_in_code_drives(engine: str, tmp_path: Path) -> None:
+    """Its wheels of 0.1 m are told 6 rad/s, then none, then the sides turn against each other."""
+    struts = "".join(STRUT.format(name, *place) for name, place in CORNERS.items())
+    (tmp_path / "car.xml").write_text(CAR.format(struts))
+    gains = {
+        "stiffness": {"leg": 40.0, "wheel": 0.0},
+        "damping": {"leg": 2.0, "wheel": 1.0},
+        "action_scale": {"": 0.25},
+    }
+    car = {
+        **{"asset.file": str(tmp_path / "car.xml"), "asset.foot_names": [*CORNERS], "asset.imu_site": ""},
+        **{"asset.colliders": [*CORNERS], "asset.joint_speed_limits": {}, "asset.effort": {}},
+        **{
+            "init_state.default_joint_angles": {"": 0.0},
+            "init_state.pos": [],
+            "rewards.pose_weights": {"leg": 1.0, "": 0.0},
+        },
+        **{f"control.{name}": value for name, value in gains.items()},
+    }
+    env = make_env(2, {**QUIET, **STILL, **car, "sim.engine": engine}, env_class=OnWheels)
+    of_wheels = torch.tensor(["wheel" in name for name in env.robot.joint_names])
+    wheels = of_wheels.float()
+    sides = torch.tensor([1.0 if name[1] == "L" else -1.0 for name in env.robot.joint_names])
+    for actions, forward, turns in [
+        (0.3 * wheels, 0.6, False),
+        (0.0 * wheels, 0.0, False),
+        (-0.3 * wheels * sides, 0.0, True),
+    ]:
+        for _ in range(100):
+            env.step(actions.repeat(2, 1))
+        assert env.base_lin_vel[:, 0].tolist() == pytest.approx([forward] * 2, abs=0.05)
+        assert bool((env.base_ang_vel[:, 2] > 0.1).all()) == turns
+    assert not env.fell.any()
+    assert not env.joint_reading[:, of_wheels].any()

@@ -13,7 +13,8 @@ from legged_mw.robot import makers
 from legged_mw.robot.draft import draft, values
 from legged_mw.robot.makers import FILE, find_maker, read_makers
 from legged_mw.robot.measure import Joint, suggest
-from legged_mw.robot.new import config_text
+from legged_mw.robot.new import config_text, refuse_wheels
+from legged_mw.utils.errors import UserError
 
 QUADRUPED = [f"{leg}_{joint}_joint" for leg in ("FL", "FR", "RL", "RR") for joint in ("hip", "thigh", "calf")]
 HUMANOID = [
@@ -189,3 +190,34 @@ def test_every_gain_has_its_damping() -> None:
         assert all(0.001 < value / maker.kp[key] < 0.3 for key, value in maker.kd.items() if key in maker.kp), (
             maker.name
         )
+
+
+# ---- wheels ----
+
+WHEEL = '<body name="{0}_w" pos="0 0 -0.3"><joint name="{0}_wheel_joint" axis="0 1 0"/><geom name="{0}" {1} mass="0.3"/></body>'
+SHAPES = {
+    "cylinder": 'type="cylinder" size="0.08 0.02" zaxis="0 1 0"',
+    "sphere": 'type="sphere" size="0.08"',
+    "box": 'type="box" size="0.08 0.02 0.08"',
+    "sphere off its axis": 'type="sphere" size="0.08" pos="0.01 0 0"',
+}
+
+
+@pytest.mark.parametrize(
+    ("shape", "rolls"), [("cylinder", True), ("sphere", True), ("box", False), ("sphere off its axis", False)]
+)
+def test_a_wheel_is_known_by_its_joint_and_its_shape(shape: str, rolls: bool, tmp_path: Path) -> None:
+    """And legs on wheels are bent as legs on feet are: the wheel is no ankle."""
+    file, plain = four_legs(tmp_path, ONE_WAY), draft(four_legs(tmp_path, ONE_WAY))
+    text = file.read_text()
+    for leg in ("FL", "FR", "RL", "RR"):
+        foot = re.search(rf'<geom name="{leg}" [^>]*/>', text)
+        assert foot
+        text = text.replace(foot[0], WHEEL.format(leg, SHAPES[shape]))
+    file.write_text(text)
+    found = draft(file)
+    assert len(found.wheels) == (4 if rolls else 0)
+    if rolls:
+        assert found.angles["FL_calf_joint"] == pytest.approx(plain.pose[1], abs=0.05)
+        with pytest.raises(UserError, match="is on wheels: FL_wheel_joint"):
+            refuse_wheels(found, file)

@@ -400,11 +400,13 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in simple and "delay_ms" in text and "delay_ms" not in simple
     biped = config_text(draft(TOY), TOY, "toy", mirrors=True)
     assert (
-        "class ToyFlatCfg(BipedCfg):" in biped
-        and "class ToyFlatCfgPPO(BipedCfgPPO):" in biped
+        "class ToyFlatCfg(UprightBipedCfg):" in biped
+        and "class ToyFlatCfgPPO(UprightBipedCfgPPO):" in biped
         and "use_data" not in biped
     )
-    assert 'pose_weights = {"": 0.02, "ankle": 0.05}' in biped and "min_feet_distance = 0.12" in biped
+    assert 'pose_weights = {"": 0.14, "ankle": 1.5}' in biped and "min_feet_distance = 0.12" in biped
+    simple = config_text(draft(TOY, simple=True), TOY, "toy")
+    assert "class ToyFlatCfg(BipedCfg):" in simple and 'pose_weights = {"": 0.02, "ankle": 0.05}' in simple
     assert "use_data_augmentation = False  # left and right are not alike" in config_text(draft(TOY), TOY, "toy")
     free = tmp_path / "free.xml"
     free.write_text(GO1.read_text().replace("actuatorfrcrange", "user"))

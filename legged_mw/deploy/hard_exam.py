@@ -17,6 +17,7 @@ from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Fleet, lowest_point
 from legged_mw.deploy.stage import DeployStage
+from legged_mw.deploy.user_scene import torque_limits
 from legged_mw.eval import hard
 from legged_mw.eval.hard import CONDITIONS, NOISE, Walk
 from legged_mw.eval.walking import GRAVITY, ExamRules
@@ -252,17 +253,6 @@ def feet_of(fleet: Fleet) -> list[list[int]]:
 def has_sole(model: mujoco.MjModel, geoms: Sequence[int]) -> bool:
     """Whether a foot is flat: more than one sphere."""
     return len(geoms) > 1 or model.geom_type[geoms[0]] != mujoco.mjtGeom.mjGEOM_SPHERE
-
-
-def torque_limits(model: mujoco.MjModel, joints: Sequence[int]) -> Floats:
-    """(D,) [N m] the lowest limit of each joint: its own, or its actuator's; infinite without one."""
-    found = np.where(model.jnt_actfrclimited[joints] > 0, np.abs(model.jnt_actfrcrange[joints]).max(axis=1), np.inf)
-    for i, joint in enumerate(joints):
-        for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
-            gear = abs(model.actuator_gear[actuator, 0])
-            if model.actuator_forcelimited[actuator]:
-                found[i] = min(found[i], gear * np.abs(model.actuator_forcerange[actuator]).max())
-    return found
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------

@@ -1,13 +1,15 @@
 """A scene of the user's, such as a vendor's own MJCF, made into one that an export can run in.
 
 Joints are found by name. Its actuators are replaced by position servos with the contract's gains and the torque limits
-of the file; the sensors of the contract are added. Masses, contacts, joint friction, solver and time step stay. The
-file is read as every stranger's: ``legged_mw.robot.mjcf`` refuses what no robot needs, and nothing in it is run.
+of the file, else of the export; the sensors of the contract are added. Euler gives way to implicitfast: vendors' joints
+may have no inertia of their own, and a servo's damping, which Euler integrates explicitly, would throw them about.
+Masses, contacts, joint friction, solver and time step stay. The file is read as every stranger's:
+``legged_mw.robot.mjcf`` refuses what no robot needs, and nothing in it is run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, compile_scene, part
+from legged_mw.deploy.robot import Floats
 from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import UserError, unknown
 
@@ -33,16 +36,18 @@ def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[m
     if not file.is_file():
         raise UserError(f"--scene: no file {file}")
     if contract.motors.law != "servo":
-        raise UserError(f"--scene: the policy drives motors of the law '{contract.motors.law}'; a scene gets servos")
+        raise UserError(
+            f"--scene: in a scene every joint gets a servo, but the policy drives motors of the law '{contract.motors.law}': leave it out"
+        )
     try:
         source = XmlSource(file)
         if source.root.tag != "mujoco":
             raise ValueError(f"its first element is <{source.root.tag}>; a scene is an MJCF with the element <mujoco>")
         spec = source.spec()
-        limits = _drop_motors(spec)
+        stated = _drop_motors(spec)
         _find_joints(spec, file, contract)
-        _make_ready(spec, contract, limits)
         own = compile_scene(part(folder, SCENE_FILE))
+        _make_ready(spec, contract, _missing_limits(spec, own, contract, stated) | stated)
         imu = _find_imu(spec, own, contract)
         _stand(spec, contract, lowest)
         feet = _find_feet(spec, own, contract, lowest)
@@ -72,7 +77,9 @@ def _in_scene(
             f'{contract.period:g} s; write one in it: <option timestep="{contract.timestep:g}"/>'
         )
     kept = {row.name: row.sensors for row in contract.rows if row.sensors}
-    names = [model.sensor(i).name for i in range(model.nsensor)]
+    names = [
+        name for i in range(model.nsensor) if not (name := model.sensor(i).name).startswith(("deploy/", "contact/"))
+    ]
     for row, wanted in kept.items():
         for name in wanted:
             if name not in names:
@@ -92,7 +99,7 @@ def _in_scene(
 
 
 def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Remove the file's actuators. Return joint -> highest torque [N m], of those that state one."""
+    """Remove the file's actuators and keyframes. Return joint -> highest torque [N m], of those that state one."""
     found: dict[str, float] = {}
     for actuator in list(spec.actuators):
         gear = abs(float(actuator.gear[0]))
@@ -102,6 +109,35 @@ def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
         elif actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and control[1] > control[0]:
             found[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
         spec.delete(actuator)
+    for key in list(spec.keys):  # with a control for each actuator
+        spec.delete(key)
+    spec.nkey = 0
+    return found
+
+
+def _missing_limits(
+    spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract, stated: dict[str, float]
+) -> dict[str, float]:
+    """The export's torque limits [N m] of those joints for which the file states none."""
+    here, exported = (
+        torque_limits(model, [model.joint(name).id for name in contract.joints]) for model in (spec.compile(), own)
+    )
+    known = zip(contract.joints, here, exported, strict=True)
+    return {
+        name: float(theirs)
+        for name, joints_own, theirs in known
+        if name not in stated and np.isinf(joints_own) and np.isfinite(theirs)
+    }
+
+
+def torque_limits(model: mujoco.MjModel, joints: Sequence[int]) -> Floats:
+    """(D,) [N m] the lowest limit of each joint: its own, or its actuator's; infinite without one."""
+    found = np.where(model.jnt_actfrclimited[joints] > 0, np.abs(model.jnt_actfrcrange[joints]).max(axis=1), np.inf)
+    for i, joint in enumerate(joints):
+        for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
+            gear = abs(model.actuator_gear[actuator, 0])
+            if model.actuator_forcelimited[actuator]:
+                found[i] = min(found[i], gear * np.abs(model.actuator_forcerange[actuator]).max())
     return found
 
 
@@ -112,7 +148,9 @@ def _find_joints(spec: mujoco.MjSpec, file: Path, contract: Contract) -> None:
         if name not in names:
             raise UserError(f"--scene: {unknown('joint', name, names, file.name)}")
     if others := [name or "one without a name" for name in names if name not in contract.joints]:
-        raise UserError(f"--scene: {file.name} has joints that the policy does not move: {', '.join(others)}")
+        raise UserError(
+            f"--scene: {file.name} has joints that the policy does not move: {', '.join(others)}; take them out of a copy of it"
+        )
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     root = _root(spec, contract)
     if [joint.parent.name for joint in free] != [root.name] or root.parent.name != "world":
@@ -132,9 +170,8 @@ def _root(spec: mujoco.MjSpec, contract: Contract) -> mujoco.MjsBody:
 
 def _make_ready(spec: mujoco.MjSpec, contract: Contract, limits: dict[str, float]) -> None:
     """Servos by the contract's gains, a ground where there is none, groups as a height scan wants them."""
-    for key in list(spec.keys):
-        spec.delete(key)
-    spec.nkey = 0
+    if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for i, name in enumerate(contract.joints):
         stiffness, damping = float(contract.stiffness[i]), float(contract.damping[i])
         limit = {"forcelimited": True, "forcerange": [-limits[name], limits[name]]} if name in limits else {}

@@ -573,13 +573,15 @@ class LeggedRobot(RobotTask):
         return (forces[..., :2].norm(dim=2) > 5.0 * forces[..., 2].abs()).any(dim=1).float()
 
     def _reward_single_stance(self) -> Tensor:
-        """Biped: time on exactly one foot [s], at most ``rewards.max_single_stance``, while moving. [I]
+        """Biped: time on exactly one foot [s] while moving, up to ``rewards.max_single_stance`` and down again. [I, M]
 
         It is the smaller of one foot's contact time and the other's air time, so that short steps earn little.
+        Beyond ``max_single_stance`` it falls off, to 0 at twice that time.
         """
         self._need_two_feet("single_stance")
         since = torch.where(self.foot_contact, self.feet_contact_time, self.feet_air_time).amin(dim=1)
-        return torch.where(self._on_one_foot() & self.moving, since.clamp(max=self.cfg.rewards.max_single_stance), 0.0)
+        most = self.cfg.rewards.max_single_stance
+        return torch.where(self._on_one_foot() & self.moving, (most - (since - most).abs()).clamp(min=0.0), 0.0)
 
     def _reward_no_fly(self) -> Tensor:
         """Biped: 1 on exactly one foot while moving, and on both while standing; else 0. [L: Cassie; standing ours]"""

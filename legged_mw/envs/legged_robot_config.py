@@ -94,7 +94,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
         min_feet_distance: Height = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
         max_contact_force: NonNegative = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
-        max_single_stance: Positive = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
+        max_single_stance: Positive = 0.4  # on one foot, for which `single_stance` pays most [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):
             """All [P]."""

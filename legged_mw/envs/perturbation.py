@@ -91,11 +91,14 @@ class Perturbation:
         self._clock.masked_fill_(mask, 0.0)
 
     def _push_robots(self) -> None:
-        """Give the root a random horizontal velocity where its clock has run down. [L]"""
+        """Give the root a random horizontal velocity, and angular velocity, where its clock has run down. [L]"""
         self._push_clock.sub_(1.0)
         due = self._push_clock <= 0.0
         if maybe_any(due):
             speed = self.cfg.max_push_vel_xy
             draw = torch.rand(self._sim.num_envs, 2, device=self._sim.device).mul_(2.0 * speed).sub_(speed)
             assign(self._sim.qvel[:, :2], due, draw)
+            if turn := self.cfg.max_push_ang_vel:
+                draw = torch.rand(self._sim.num_envs, 3, device=self._sim.device).mul_(2.0 * turn).sub_(turn)
+                assign(self._sim.qvel[:, 3:6], due, draw)
             self._push_clock.masked_fill_(due, round(self.cfg.push_interval_s / self._dt))

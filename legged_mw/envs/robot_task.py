@@ -655,6 +655,13 @@ class RobotTask(BaseTask):
         """Angles beyond the joints' soft limits [rad]. [L]"""
         return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
 
+    def _reward_target_limits(self) -> Tensor:
+        """Targets of the servos beyond the joints' soft limits [rad]; a servo turns to its range at most. [ours]"""
+        by_angle = self.motor_law in ("servo", "dc_motor", "network") and self.cfg.control.action_origin != "speed"
+        require(by_angle, "target_limits", "actions are no angles under this motor law (docs/motors.md)")
+        targets = self.actuators.targets
+        return (targets - targets.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
+
     def _reward_pose(self) -> Tensor:
         """Staying near the default pose, each joint with its weight. [P]"""
         return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))

@@ -175,6 +175,7 @@ class RobotTaskCfg(Config):
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
         max_push_vel_xy: Speed = 1.0  # each axis U(-max, max) [m/s] [L]
+        max_push_ang_vel: Speed = 0.0  # of a push that turns, each axis likewise; 0: it does not [rad/s] [humanoid-gym]
 
     class domain_rand:
         """What differs between worlds: ends of uniform distributions; an empty list leaves the model's value."""

@@ -380,30 +380,34 @@ def peer_label(result: Mapping[str, Any]) -> str:
     return f"best of {count}" if count else ""
 
 
-def _beside(published: Mapping[str, Any], name: str) -> str:
-    """The published policies' errors and pushes under one condition, as the table's last columns."""
-    error, share = published["errors"].get(name), published["pushes"].get(name)
-    if error is None and share is None:
-        return ""
-    errors = ", ".join(f"{value:.2f}" for value in error) if error else ""
-    return f"{errors:>26}{'' if share is None else f'{share:.2f}':>10}"
+def condition_rows(result: Mapping[str, Any]) -> list[list[str]]:
+    """A heading, then a row for each condition: name, falls, errors, drift, pushes; and the published policies' best."""
+    names = ", ".join(name.removesuffix(" rate") for name, _ in AXES)
+    rows = [["", "falls", f"error {names}", "drift [m]", f"pushes of {result['push_speed']:g} m/s"]]
+    published = result.get("peers")
+    rows[0] += [f"error, {peer_label(result)}", f"pushes, {peer_label(result)}"] if published else []
+    for name, each in result["conditions"].items():
+        drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
+        title = f"{name} of {result['load']:g} kg" if name == "load" else name
+        rows.append([title, str(each["falls"]), _errors(each["error"], 3), drift, f"{each['pushes']:.2f}"])
+        if published:
+            share = published["pushes"].get(name)
+            rows[-1] += [_errors(published["errors"].get(name, ()), 2), "" if share is None else f"{share:.2f}"]
+    return rows
+
+
+def _errors(errors: Sequence[float], digits: int) -> str:
+    return ", ".join(f"{value:.{digits}f}" for value in errors)
 
 
 def table(result: Mapping[str, Any]) -> str:
     """The result as text."""
-    names = ", ".join(name.removesuffix(" rate") for name, _ in AXES)
-    pushed = f"pushes of {result['push_speed']:g} m/s"
     lines = [f"hard exam: {len(result['commands'])} commands and {PUSH_DIRECTIONS} pushes under each condition"]
-    published, label = result.get("peers", {"errors": {}, "pushes": {}}), peer_label(result)
-    theirs = f"{f'errors, pushes of {label}':>36}" if label else ""
-    lines.append(f"{'':<16}{'falls':>6}{f'error {names}':>24}{'drift [m]':>11}{pushed:>20}{theirs}")
-    for name, each in result["conditions"].items():
-        error = ", ".join(f"{value:.3f}" for value in each["error"])
-        drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
-        title = f"{name} {result['load']:g} kg" if name == "load" else name
-        lines.append(
-            f"{title:<16}{each['falls']:>6}{error:>24}{drift:>11}{each['pushes']:>20.2f}{_beside(published, name)}"
-        )
+    rows, label = condition_rows(result), peer_label(result)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for name, *cells in rows:
+        padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
+        lines.append("   ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
     at = f"walking at {result['vx']:g} m/s"
     lines += ["", f"{at:<34}{'this policy':>12}{'ready at':>10}{label:>12}".rstrip()]
     for row in figures(result):

@@ -107,13 +107,7 @@ def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]
 def _hard(column: Column) -> str:
     """The chapter of the hard exam: conditions, how it looks, a stride in pictures."""
     result = column.exam["hard"]
-    heads = ["", "falls", "error vx, vy, yaw rate", "drift [m]", f"pushes of {result['push_speed']:g} m/s survived"]
-    rows = []
-    for name, each in result["conditions"].items():
-        error = ", ".join(f"{value:.3f}" for value in each["error"])
-        drift = "fell" if each["drift"] is None else f"{each['drift']:.3f}"
-        title = f"load of {result['load']:g} kg" if name == "load" else name
-        rows.append([title, str(each["falls"]), error, drift, f"{each['pushes']:.0%}"])
+    heads, *rows = hard.condition_rows(result)
     looked = (
         exam_table([column], [hard.figures(result)], hard.peer_label(result), "ready at") if result["looks"] else ""
     )

@@ -56,6 +56,8 @@ def main() -> None:
         # refuse before the page, not after it
         new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
     found = draft(file, args.sim)
+    if args.new:
+        new.refuse_wheels(found, file)
     env = as_env(found, file)
     show(env, file.name, image, found)
     if args.new:

@@ -37,7 +37,7 @@ from legged_mw.robot.measure import (
     suggest,
     what_joints_bear,
 )
-from legged_mw.robot.pose import SIDEWAYS, Judged, joints_to, judge_poses, walking_joints
+from legged_mw.robot.pose import SIDEWAYS, Judged, find_wheels, joints_to, judge_poses, walking_joints
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
@@ -53,10 +53,13 @@ FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 3, "ls_iterations": 10}
 # reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
 # soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
-LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25}
-# of `energy`, per kilogram: BipedCfg's -0.002 of a G1 of 35 kg, Playground's -0.001 of a Go1 of 13 kg
-ENERGY = {2: -0.07, 4: -0.013}
-LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "pose": 1.0, "action_rate": -0.02, "feet_orientation": -1.0}
+LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25, "target_limits": -1.0}
+# of `energy`, per kilogram: -0.001 of a G1 of 35 kg (docs/archive/go2_and_g1.md), Playground's -0.001 of a Go1 of 13 kg
+ENERGY = {2: -0.035, 4: -0.013}
+LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "action_rate": -0.02, "feet_orientation": -1.0}
+# [s], [m/s] each axis, [rad/s] likewise [go2_rl_gym: 4, 0.4, 0.6]
+PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 0.5, "max_push_ang_vel": 0.6}
+BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # of a biped that follows a gait clock
 CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
 
 
@@ -77,6 +80,7 @@ class Draft(NamedTuple):
     judged: list[Judged]  # the poses that were judged, the chosen one first
     simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
     angles: dict[str, float]  # joint -> default angle [rad], those that are held too
+    wheels: list[str]  # joints that roll, for which a draft has no motor law
 
     @property
     def held(self) -> list[str]:
@@ -121,11 +125,14 @@ def draft(file: Path, simple: bool = False) -> Draft:
     ]
     if held:
         guessed.append(f"held: {', '.join(patterns(held, robot.joint_names))}: {len(held)} joints that do not walk")
+    wheels = find_wheels(robot, np.array(pose))
+    if wheels:
+        guessed.append(f"wheels: {', '.join(wheels)}: without a range, and round about their axis")
     # the only site of a bare robot is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     notes = [*read.notes, *more]
     return Draft(
-        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles
+        robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles, wheels
     )
 
 
@@ -211,7 +218,8 @@ def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]
         return LeggedRobotCfg, LeggedRobotCfgPPO
     presets = import_task(ROOT / "configs/base.py")
     if len(found.feet) == 2:
-        return presets.BipedCfg, presets.BipedCfgPPO
+        followed = (presets.BipedCfg, presets.BipedCfgPPO)  # a gait clock
+        return followed if found.simple else (presets.UprightBipedCfg, presets.UprightBipedCfgPPO)
     return presets.SimToRealCfg, presets.SimToRealCfgPPO
 
 
@@ -259,7 +267,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
     rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
-    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "rewards": rewards}
+    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "perturbation": dict(PUSHES), "rewards": rewards}
 
 
 def _energy(found: Draft) -> dict[str, float]:
@@ -289,17 +297,14 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
     robot = found.robot
     data = posed(robot.physics, found.pose)
     left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
+    weights = (WALKS, ANKLE, HELD, QUIET) if found.simple else UPRIGHT
     rewards: dict[str, Any] = {
         **low,
         "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
-        "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
-        "scales": {
-            "contact_phase": 1.0,
-            "no_fly": 0.5,
-            **({} if found.simple else {**LOOKS_OF_A_BIPED, **_energy(found)}),
-        },
+        "pose_weights": table(pose_weights(robot, found.pose, found.feet, weights), robot.joint_names),
+        "scales": dict(BY_CLOCK) if found.simple else {**LOOKS_OF_A_BIPED, **_energy(found)},
     }
-    worlds = _worlds(found, (-0.03, 0.06))
+    worlds = _worlds(found, (-0.03, 0.14))
     if not found.simple:
         ranges = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1.0, 1.0]}
         return {"commands": {"ranges": ranges}, "domain_rand": worlds, "rewards": rewards}
@@ -439,15 +444,26 @@ def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
 
 # ---- weights of the pose reward
 
-# from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
+# of two feet, with a gait clock: from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
 WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
+# without: 1 / (29 std^2) of mjlab's standard deviations while a G1 walks, 0.5, 0.15 and 0.1 rad
+UPRIGHT = (0.14, 1.5, 1.5, 3.4)
 KNEE_WALKS = 0.1  # on more feet, where all other joints have 1 [MuJoCo Playground]
 
 
-def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
-    """Weights (D,) of the pose reward: smallest for what walks (hip and knee; on more than two feet the knee alone)."""
+def pose_weights(
+    robot: RobotModel,
+    pose: Sequence[float],
+    feet: Sequence[Foot],
+    biped: tuple[float, float, float, float] = (WALKS, ANKLE, HELD, QUIET),
+) -> list[float]:
+    """Weights (D,) of the pose reward: smallest for what walks (hip and knee; on more than two feet the knee alone).
+
+    ``biped``: on two feet, those of hip and knee, of the ankle, of a leg's other joints, and of arms and waist.
+    """
+    walks, ankle, held, quiet = biped
     model, data = robot.physics, posed(robot.physics, pose)
-    weights = [QUIET if len(feet) == 2 else 1.0] * len(robot.joint_names)
+    weights = [quiet if len(feet) == 2 else 1.0] * len(robot.joint_names)
     for foot in feet:
         legs = joints_to(model, foot)
         sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
@@ -456,9 +472,9 @@ def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot])
                 weights[joint - 1] = KNEE_WALKS
             continue
         for joint in legs:
-            weights[joint - 1] = HELD
+            weights[joint - 1] = held
         for joint in sideways[:2]:
-            weights[joint - 1] = WALKS
+            weights[joint - 1] = walks
         for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
-            weights[joint - 1] = ANKLE
+            weights[joint - 1] = ankle
     return weights

@@ -69,7 +69,8 @@ _COMMENTS = {
     "delay_ms": "[ms] from an action to its torque",
     "dof_acc": "no jerks",
     "feet_impact_vel": "no stamping",
-    "pose": "arms and waist quiet",
+    "target_limits": "no targets beyond a joint's range",
+    "max_push_ang_vel": "[rad/s] a push turns it too",
     "feet_orientation": "soles level",
     "energy": "by its mass",
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
@@ -133,6 +134,16 @@ def class_name(name: str) -> str:
     """``name`` in capitals: "my_dog" is MyDog; an underscore between digits stays, "h1_2" is H1_2."""
     capitals = "_".join(part[:1].upper() + part[1:] for part in name.split("_"))
     return re.sub(r"(?<!\d)_|_(?!\d)", "", capitals)
+
+
+def refuse_wheels(found: Draft, file: Path) -> None:
+    """Raise UserError for a robot on wheels: the servos of a draft turn to an angle, and a wheel turns at a speed."""
+    if found.wheels:
+        raise UserError(
+            f"{shown(file)} is on wheels: {', '.join(found.wheels)} have no range and end in a round collider, and a draft "
+            "has servos that turn to an angle. Write a task that drives wheels by speed (docs/motors.md#wheels), or make "
+            "these joints fixed in a copy of the file: it walks on locked wheels"
+        )
 
 
 def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> str:
@@ -200,9 +211,10 @@ def _learner(found: Draft, train: str) -> list[str]:
         "        overrides = {",
         '            "commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',
     ]
+    lines.append(f"            {off},")
     if len(found.feet) == 2:
-        off += ', "actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0]'
-    return [*lines, f"            {off},", "        }"]
+        lines.append('            "actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0],')
+    return [*lines, "        }"]
 
 
 def _before_a_real_robot(found: Draft) -> str:

@@ -23,7 +23,7 @@ from legged_mw.robot.makers import Maker
 from legged_mw.robot.measure import SAG, inside_by
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.surface_points import surfaces
+from legged_mw.sim.surface_points import SPACING, spheres_on, surfaces
 
 FloatArray = NDArray[np.float64]
 
@@ -113,7 +113,7 @@ def judge_poses(robot: RobotModel, feet: Sequence[Sole], maker: Maker | None, ke
     """All candidates, the chosen one first. ``keyframe``: whether ``robot.pose`` is that of the file's keyframe."""
     zero = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
     neutral = hang_arms(robot, zero, feet)
-    feet = [_whole(robot.physics, neutral, foot) for foot in feet]
+    feet = [_whole(robot, neutral, foot) for foot in feet]
     legs = find_legs(robot, neutral, feet)
     candidates = []
     if keyframe and robot.keyframe is not None:
@@ -143,9 +143,10 @@ def find_legs(robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole]) -> l
     model = robot.physics
     data = posed(model, neutral)
     points = surfaces(model, data, [geom for foot in feet for geom in foot.geoms])
-    legs = []
+    legs, wheels = [], find_wheels(robot, neutral)
     for foot in feet:
         joints = [joint for joint in joints_to(model, foot) if _is_sideways(model, data, joint)]
+        joints = [joint for joint in joints if model.joint(joint).name not in wheels]
         if len(joints) < 2:
             return []
         sole = np.concatenate([points[geom] for geom in foot.geoms])[:, [0, 2]]
@@ -153,10 +154,12 @@ def find_legs(robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole]) -> l
     return legs
 
 
-def _whole(model: mujoco.MjModel, neutral: FloatArray, foot: Sole) -> Sole:
+def _whole(robot: RobotModel, neutral: FloatArray, foot: Sole) -> Sole:
     """The foot, with all geoms of its body if the leg has an ankle; else a shank may belong to that body."""
-    data = posed(model, neutral)
-    if sum(_is_sideways(model, data, joint) for joint in joints_to(model, foot)) < 3:
+    model = robot.physics
+    data, wheels = posed(model, neutral), find_wheels(robot, neutral)
+    sideways = [joint for joint in joints_to(model, foot) if _is_sideways(model, data, joint)]
+    if sum(model.joint(joint).name not in wheels for joint in sideways) < 3:
         return foot
     body = model.body(int(model.geom(foot.geoms[0]).bodyid[0]))
     geoms = range(int(body.geomadr[0]), int(body.geomadr[0] + body.geomnum[0]))
@@ -319,6 +322,41 @@ def _height_of(model: mujoco.MjModel, angles: FloatArray, joint: int, angle: flo
     data = posed(model, trial)
     mujoco.mj_comPos(model, data)
     return float(data.subtree_com[model.jnt_bodyid[joint], 2])
+
+
+# ---- wheels ----
+
+_ROUND = 0.05  # of the radius: how far the rim of a wheel is from a circle
+
+
+def find_wheels(robot: RobotModel, pose: FloatArray) -> list[str]:
+    """The last joints of limbs that have no range and carry a collider that is round about their axis."""
+    model = robot.physics
+    data = posed(model, pose)
+    found = []
+    for joint in range(1, model.njnt):
+        body = int(model.jnt_bodyid[joint])
+        first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+        geoms = [geom for geom in range(first, first + count) if model.geom_conaffinity[geom]]
+        turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[joint]
+        if turns and geoms and body not in model.body_parentid and _is_round(model, data, joint, geoms):
+            found.append(model.joint(joint).name)
+    return found
+
+
+def _is_round(model: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Sequence[int]) -> bool:
+    """Whether the outline of ``geoms``, seen along the axis of ``joint``, is a circle about it."""
+    axis = data.xaxis[joint]
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    turns = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)[:, None]
+    ways = np.cos(turns) * across + np.sin(turns) * np.cross(axis, across)  # (32, 3)
+    reach = np.zeros(len(ways))  # [m] of the outline in each of these directions
+    for geom in geoms:
+        places, radius = spheres_on(model, geom, SPACING)
+        points = data.geom_xpos[geom] + places @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
+        reach = np.maximum(reach, (ways @ points.T).max(axis=1) + radius)
+    return bool(reach.min() > (1.0 - _ROUND) * reach.max())
 
 
 # ---- crouches ----

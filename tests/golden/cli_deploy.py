@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from golden.table import Table
+from test_user_scene import GO2, NO_SCENES, WRONG, vendors
+
+from golden.table import Run, Table
 from legged_mw.deploy import safety
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.simulated import lowest_point
+from legged_mw.deploy.user_scene import fit
 from legged_mw.unitree import handset
 from legged_mw.unitree.faults import parse_faults
 from legged_mw.utils.commands import command_table
@@ -167,6 +173,7 @@ def table() -> Table:
             lambda root: handset.load_remote(Path("a.yaml")),
             lambda root, text=text: (root / "a.yaml").write_text(text),
         )
+    of_scenes(made)
     made.calls({f"fault: {text}": lambda text=text: parse_faults([text], joints) for text in FAULTS})
     made.calls(
         {
@@ -175,6 +182,26 @@ def table() -> Table:
         }
     )
     return made
+
+
+def of_scenes(made: Table) -> None:
+    """--scene: files that do not fit go2_flat, and policies that fit no scene."""
+    contract = read_contract(GO2)
+    asks_more = replace(contract.rows[0], name="heat", sensors=("heat/imu",))
+    policies = {
+        "motors with a law": replace(contract, motors=contract.motors._replace(law="torque")),
+        "a sensor of the task's own": replace(contract, rows=(asks_more, *contract.rows[1:])),
+    }
+
+    def fits(of: Contract = contract) -> Run:
+        return lambda root: fit(root / "vendor.xml", GO2, of, lowest_point)
+
+    for name, change in WRONG.items():
+        made.add(f"scene: {name}", fits(), lambda root, change=change: vendors(root, change))
+    for name, text in NO_SCENES.items():
+        made.add(f"scene: {name}", fits(), lambda root, text=text: (root / "vendor.xml").write_text(text))
+    for name, of in policies.items():
+        made.add(f"scene: {name}", fits(of), vendors)
 
 
 LIMITS = [("tlit", 3), ("tilt", "x"), ("tilt", -1), ("tilt", True)]

@@ -259,6 +259,14 @@ LOST: dict[str, tuple[str, str]] = {  # a file whose leg is a mesh that cannot b
         for ending in (".stl", ".ply")
     },
 }
+WHEELED = """<mujoco><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 0.3"><freejoint/>
+<geom name="trunk" type="box" size="0.3 0.1 0.05" mass="5"/>{}</body></worldbody></mujoco>""".format(
+    "".join(
+        f'<body name="{side}" pos="{0.2 if side[0] == "F" else -0.2} {0.15 if side[1] == "L" else -0.15} -0.2">'
+        f'<joint name="{side}_wheel" axis="0 1 0"/><geom name="{side}_tyre" type="cylinder" size="0.1 0.02" zaxis="0 1 0" mass="1"/></body>'
+        for side in ("FL", "FR", "RL", "RR")
+    )
+)
 WHOLE = ("control.stiffness", "control.damping", "control.action_scale", "rewards.pose_weights")  # tables of all joints
 SILENT = ("init_state.default_joint_angles", "asset.joint_speed_limits")
 FIELDS = {  # of go1_flat
@@ -307,6 +315,7 @@ def table() -> Table:
     for name, (file, text) in LOST.items():
         made.add(f"lost, {name}", lambda root, file=file: collide_with_leg(root / file), given(text, file))
     made.add("lost, a foot", lambda root: draft(root / "robot.urdf"), given(LOST["a link, .stl"][1], "robot.urdf"))
+    made.add("a draft on wheels", program("robot", "ROOT/car.xml", "--new", "mine"), given(WHEELED, "car.xml"))
     made.add("no URDF", reads("none.urdf"))
     for name, fields in FIELDS.items():
         made.add(f"go1_flat, {name}", lambda root, fields=fields: make_env(1, fields))

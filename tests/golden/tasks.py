@@ -63,6 +63,7 @@ FIELDS: dict[str, dict[str, Any]] = {
     "another value to sense": {"asset.sense": ["forces"]},
     "a flight of four feet": only_scales(no_fly=1.0),
     "a stance of four feet": only_scales(single_stance=1.0),
+    "limits of targets that are torques": {**only_scales(target_limits=-1.0), "control.actuator": "torque"},
     "pushes of itself that cannot be": only_scales(self_collision=-1.0),
     "an end by what never touches": {
         "asset.terminate_after_contacts_on": ["trunk_box"],
