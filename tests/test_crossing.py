@@ -230,12 +230,25 @@ def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest
     """Both cross the ground that the user chose; tables, figures, picture and chapter are there."""
     root, folder = runs
     monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "GRID", (3, 3, 3))
     monkeypatch.setattr(rough, "SECONDS", 0.1)
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     draw = plots.sections
     monkeypatch.setattr(plots, "sections", lambda *args: draw(*args)[:2])  # the others are drawn in test_report
     result = run(
-        "play", root, *ROUGH, "--device", "cpu", "--eval", "--no_hard", "--compare", folder.name, "--set", KINDS
+        "play",
+        root,
+        *ROUGH,
+        "--device",
+        "cpu",
+        "--eval",
+        "--no_hard",
+        "--compare",
+        folder.name,
+        "--set",
+        KINDS,
+        "--set",
+        "exam.push_speeds=[2]",
     )
     assert result.code == 0, result.err
     walked, crossed = "falls in 22 commands", "share of 10 robots that crossed a tile"

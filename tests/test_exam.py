@@ -6,7 +6,6 @@ import argparse
 import copy
 import json
 import math
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,16 +15,15 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from program import SMALL, refused, run, trained
+from program import SMALL, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw import ROOT, programs
-from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.exam import contract_rules
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exams, plots, rollout, walking
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
 from legged_mw.eval.rollout import holding, roll_out
@@ -180,21 +178,6 @@ def test_beating_several_peers_is_beating_each() -> None:
     assert "half of each policy's own highest vx" not in text and "no policy has them all" in text
 
 
-def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
-    rules = go2(**in_common("go2"))
-    assert rules.asked_words() == (
-        "asked: vx -0.5 to 1 m/s, vy -0.4 to 0.4 m/s, yaw rate -1 to 1 rad/s, the one range that all published policies of this robot "
-        "were asked"
-    )
-    words = "* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at 0.5 m/s: compare"
-    assert rules.peer_words().startswith("Best of 10: ") and words in rules.peer_words()
-    with pytest.raises(
-        ConfigError,
-        match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1",
-    ):
-        in_common("go1")
-
-
 def test_the_common_range_in_training_and_in_deploy() -> None:
     """It goes before what the config says of the ranges and speeds; the rest of the section stays."""
     flags = argparse.Namespace(override=[], set=["exam.peer=go2", "exam.push_speeds=[2, 3]"])
@@ -207,10 +190,6 @@ def test_the_common_range_in_training_and_in_deploy() -> None:
     contract = replace(read_contract(SHIPPED), exam={"peer": "go2", "push_vx": 0.8})
     assert contract_rules(contract, common=True) == go2(**in_common("go2")) and contract_rules(contract).push_vx == 0.8
     flags.set = []
-    with pytest.raises(
-        ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"
-    ):
-        exams.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
     rival = exams.prepare(PolicySource(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
     rollout.ask_alike([graded.task, rival.task])  # a rival is asked what the first one is, whatever it knows of peers
     assert (
@@ -249,28 +228,9 @@ def test_rules_of_an_export() -> None:
     """The shipped policy's contract says what its task's config says; one of an older export follows from its ranges."""
     contract = read_contract(SHIPPED)
     assert contract_rules(contract) == GO1
-    names = [command.name for command in contract.commands]
-    with pytest.raises(
-        ContractError,
-        match="policy.yaml: the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: a",
-    ):
-        contract_rules(replace(contract, commands=contract.commands[:2]))
-    assert names == list(RANGES)
-
-
-@pytest.mark.parametrize(
-    ("section", "line"),
-    [
-        ({"push_speeds": 3.0}, "policy.yaml: exam: 'float' object is not iterable"),
-        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no robot 'nobody' in resources/peers.yaml"),
-    ],
-)
-def test_a_contract_with_another_section(section: dict[str, Any], line: str) -> None:
-    contract = read_contract(SHIPPED)
-    trained = {c.name: (c.low, c.high) for c in contract.commands}
+    trained = {each.name: (each.low, each.high) for each in contract.commands}
     assert contract_rules(replace(contract, exam=None)) == ExamRules.from_mapping({}, trained)
-    with pytest.raises(ContractError, match=re.escape(line)):
-        contract_rules(replace(contract, exam=section))
+    assert list(trained) == list(RANGES)
 
 
 # ---- which exam grades a task
@@ -286,21 +246,11 @@ def test_a_task_without_an_exam() -> None:
     task.env_class = Pose
     task.exam = Pose.exam  # as the loader does
     assert find_exam(task) is None and make_exam(task, None) is None
-    line = f"--eval: no exam grades task 'go1_flat'; there are: {', '.join(EXAMS)}. A task that walks by command has the walking exam, "
-    with pytest.raises(
-        ConfigError, match=re.escape(line + "another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")
-    ):
+    with pytest.raises(ConfigError):
         require_exam(task)
     task.exam = "walkin"
-    with pytest.raises(
-        ConfigError, match=r"go1_flat.py: no exam 'walkin' in legged_mw/eval/exams.py; did you mean 'walking'\?"
-    ):
+    with pytest.raises(ConfigError):
         find_exam(task)
-    with pytest.raises(
-        ConfigError,
-        match="the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg",
-    ):
-        ExamRules.from_config(RobotTaskCfg())
 
 
 def test_prepare_leaves_nothing_to_chance() -> None:
@@ -646,16 +596,9 @@ def test_does_not_beat_the_peer(path: str, value: float) -> None:
 def test_table_names_every_figure() -> None:
     result = grade(FakeRobot(follow))
     text = walking.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
-    for part in (
-        "0.1234",
-        "4.56",
-        "0.789",
-        "survives pushes of 6 m/s",
-        "worst command",
-        "0.0007",
-        "walks: yes; beats the peer: no",
-    ):
-        assert part in text
+    assert all(
+        part in text for part in ("0.1234", "4.56", "0.789", "6 m/s", "0.0007", "walks: yes; beats the peer: no")
+    )
 
 
 # ---- the real environment
@@ -663,7 +606,7 @@ def test_table_names_every_figure() -> None:
 
 @pytest.fixture(scope="module")
 def standing() -> tuple[dict[str, Any], Tensor]:
-    """Zero action, which stands in the default pose: the result, and qvel (500, N, 18) as the policy saw it."""
+    """Zero action, which stands in the default pose: the result, and qvel (200, N, 18) as the policy saw it."""
     task = load_task("go1_flat")
     rollout.prepare(task)
     env = LeggedRobot(task.cfg, "cpu")
@@ -673,7 +616,10 @@ def standing() -> tuple[dict[str, Any], Tensor]:
         seen.append(env.sim.qvel.clone())
         return torch.zeros(WORLDS, 12)
 
-    return rollout.run_exam(env, policy), torch.stack(seen)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "EXAM_SECONDS", 4.0)
+        patch.setattr(rollout, "PUSH_AT", 0.6)
+        return rollout.run_exam(env, policy), torch.stack(seen)
 
 
 def test_standing_still(standing: tuple[dict[str, Any], Tensor]) -> None:
@@ -690,11 +636,11 @@ def test_real_pushes_move_the_robot_and_throw_it(standing: tuple[dict[str, Any],
     result, qvel = standing
     shares = list(result["pushes"].values())
     assert shares[-1] == 0.0 and shares[0] <= 1.0 and shares == sorted(shares, reverse=True)
-    before, after = qvel[150, TRACKED:, :2].view(6, 16, 2), qvel[151, TRACKED:, :2].view(6, 16, 2)
+    before, after = qvel[30, TRACKED:, :2].view(6, 16, 2), qvel[31, TRACKED:, :2].view(6, 16, 2)
     jump = (after - before)[:, 0, 0]  # k = 0: forward in the world; a foot on the ground takes a part within the step
     assert (jump > 0.5 * torch.arange(1, 7)).all() and (jump < 1.1 * torch.arange(1, 7)).all()
     assert ((after - before)[:, 1:].norm(dim=2) < 0.1).all()  # the others wait for their step
-    assert torch.equal(qvel[:150, 0], qvel[:150, 1])  # until then all worlds are the same: nothing is drawn
+    assert torch.equal(qvel[:30, 0], qvel[:30, 1])  # until then all worlds are the same: nothing is drawn
 
 
 def test_two_exams_are_the_same_exam(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -721,6 +667,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """The table is printed, the figures go into the run folder; a user's own override still counts, the exam's worlds do not move."""
     for place in (rollout, walking):  # by the environment, and by the export
         monkeypatch.setattr(place, "EXAM_SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "GRID", (3, 3, 3))
     monkeypatch.setattr(plots, "sections", lambda *_: [])  # drawn in test_report
     folder = trained(tmp_path, "--max_iterations", "1")
     result = run(
@@ -745,8 +692,9 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
+    """They scale the commands; the peer was asked others and is not spoken of."""
     monkeypatch.setattr(rollout, "EXAM_SECONDS", 2.1)
+    monkeypatch.setattr(rollout, "GRID", (3, 3, 3))
     monkeypatch.setattr(programs, "grade_export", lambda *_: [])
     monkeypatch.setattr(plots, "sections", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")
@@ -757,16 +705,3 @@ def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.Monkey
     [column] = json.loads((folder / "eval/report.json").read_text())["columns"]
     assert [row["command"] for row in column["exam"]["commands"]][:6] == [[v, 0, 0] for v in (0, 0.3, 0.6, 0.9, 0, 0)]
     assert column["exam"]["commands"][-1]["command"] == [0, -0.4, -0.6] and "beats_peer" not in column["exam"]
-
-    for more, field in (
-        (["--num_envs", "4"], "env.num_envs"),
-        (["--set", "noise.level=1"], "noise.level"),
-        (["--set", "commands.resampling_time=5"], "commands.resampling_time"),
-    ):
-        line = refused(tmp_path, "play", *start, *more)
-        assert f"--eval sets {field} itself; an exam with other values would be another exam" in line
-    assert "--ranges says what the exam asks: add --eval" in refused(
-        tmp_path, "play", *start[:-1], "--ranges", "common"
-    )
-    for more in (["--command", "1,0,0"], ["--video", "x.mp4"], ["--export", "x"]):
-        assert "one thing each" in refused(tmp_path, "play", *start, *more)

@@ -377,6 +377,7 @@ def test_statistics_are_the_sums_of_what_step_returned() -> None:
         "fell",
         "broken",
         "overflowed",
+        "walked",
         *(f"rew_{name}" for name in GO1_FLAT),
     }
     assert stats.keys() == known | broken_by

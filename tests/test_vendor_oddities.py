@@ -152,6 +152,18 @@ def test_a_missing_mesh_that_is_no_collider_of_the_task_is_a_note(kind: str, tmp
         build_toy(file, colliders=[*feet, name], contact_geoms=feet, **choices)
 
 
+def test_a_missing_mesh_at_the_end_of_a_leg_is_refused(tmp_path: Path) -> None:
+    """The draft would stand on the other legs' feet alone."""
+    file = urdf(tmp_path)
+    left, right = file.read_text().split('<joint name="right_hip"')
+    right = right.replace('xyz="0 -0.1 0"', 'xyz="0 -0.1 -0.15"').replace(FOOT, MESH)
+    file.write_text(f'{left}<joint name="right_hip"{right}')
+    with pytest.raises(
+        UserError, match=r"link 'right_leg' collides as the mesh package://there/torso.STL, which cannot"
+    ):
+        draft(file)
+
+
 # ---- looks: COLLADA, many triangles
 
 

@@ -103,6 +103,7 @@ def draft(file: Path, simple: bool = False) -> Draft:
     robot, place = env.robot, np.array(env.start_place)
     rest = stand_as_statue(robot, np.clip(robot.pose, *robot.joint_range.T), place)
     feet = guess_feet(robot, rest.qpos)
+    _refuse_lost_feet(robot, rest.qpos, feet)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
     judged = judge_poses(robot, feet, maker, from_file)
     pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T).round(4) + 0.0  # no -0.0

@@ -223,16 +223,20 @@ def _with_own_law(env_class: Any) -> Any:
 
 
 def _write_network(folder: Path) -> str:
-    """A memory and two layers of numbers: errors and speeds of two frames to a torque."""
+    """A memory and two layers of numbers: errors and speeds of two frames to a torque.
+
+    A sum has at most two products, all with powers of two: they are exact, and no CPU's order of a sum changes a torque.
+    """
     drawn, units = np.random.default_rng(3), 4
-    shapes = {
-        "weight_ih_l0": (4 * units, 4),
-        "weight_hh_l0": (4 * units, units),
-        "bias_ih_l0": (4 * units,),
-        "bias_hh_l0": (4 * units,),
-    }
-    shapes |= {"weight0": (6, units), "bias0": (6,), "weight1": (1, 6), "bias1": (1,)}
-    arrays: dict[str, Any] = {name: drawn.normal(0.0, 0.6, shape).astype(np.float32) for name, shape in shapes.items()}
+    sparse = {"weight_ih_l0": (4 * units, 4), "weight_hh_l0": (4 * units, units), "weight0": (6, units)}
+    arrays: dict[str, Any] = {name: np.zeros(shape, np.float32) for name, shape in sparse.items()}
+    for values in arrays.values():
+        rows = np.arange(len(values))
+        values[rows, drawn.permutation(rows) % values.shape[1]] = drawn.choice([-0.5, 0.25, 0.5, 1.0], len(values))
+    arrays["weight1"] = np.array([[0.0, 0.5, 0.0, 0.0, -1.0, 0.0]], np.float32)
+    biases = {"bias_ih_l0": 4 * units, "bias_hh_l0": 4 * units, "bias0": 6}
+    arrays |= {name: drawn.normal(0.0, 0.6, size).astype(np.float32) for name, size in biases.items()}
+    arrays["bias1"] = np.zeros(1, np.float32)
     scales = {"error_scale": 1.5, "speed_scale": -0.1, "torque_scale": 20.0}
     np.savez(folder / "network.npz", **arrays, activation="softsign", frames=np.array([0, 2]), in_turns=False, **scales)
     return str(folder / "network.npz")
