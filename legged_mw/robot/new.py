@@ -52,7 +52,7 @@ _COMMENTS = {
     "damping": "[N m s/rad] LOOK: likewise",
     "armature": "[kg m^2] of the rotors, published; the file has none",
     "integrator": "explicit Euler does not bear these gains on such light limbs",
-    "iterations": "with 1 a robot does not even stand under implicitfast [ours: docs/your_own_robot.md]",
+    "iterations": "with fewer the physics of light limbs is not solved [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "clip_actions": "so that a joint is moved by 1 rad at most",
     "lin_vel_x": "[m/s] LOOK: what you want of it",
