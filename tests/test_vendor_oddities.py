@@ -152,6 +152,28 @@ def test_a_missing_mesh_that_is_no_collider_of_the_task_is_a_note(kind: str, tmp
         build_toy(file, colliders=[*feet, name], contact_geoms=feet, **choices)
 
 
+def test_the_first_of_several_materials_of_a_look_is_kept(tmp_path: Path) -> None:
+    """Unitree's B2, whose exporter writes one material for each of a mesh's colours."""
+    look = '<visual><geometry><sphere radius="0.1"/></geometry>{}</visual>'.format(
+        "".join(f'<material name="m{k}"><color rgba="0.{k} 0 0 1"/></material>' for k in (1, 2))
+    )
+    robot = read_robot(urdf(tmp_path, base=look))
+    assert "materials dropped: all but the first of 1 looks" in robot.notes
+    assert any(geom.rgba[0] == pytest.approx(0.1) for geom in robot.spec.body("base").geoms)
+
+
+def test_a_link_of_hardly_any_mass_has_none(tmp_path: Path) -> None:
+    """Unitree's B2: links of sensors have 4e-15 kg and moments of 2e-27 kg m^2, which MuJoCo refuses."""
+    file = urdf(tmp_path)
+    speck = '<mass value="4e-15"/><inertia ixx="2e-27" ixy="0" ixz="0" iyy="2e-27" iyz="0" izz="2e-27"/>'
+    joint = '<joint name="fixed" type="fixed"><parent link="base"/><child link="lidar"/></joint>'
+    lidar = f'<link name="lidar"><inertial>{speck}</inertial></link>{joint}</robot>'
+    file.write_text(file.read_text().replace("</robot>", lidar))
+    robot = read_robot(file)
+    assert "masses below 1e-09 kg dropped: those of link 'lidar'" in robot.notes
+    assert robot.model.body_mass.sum() == pytest.approx(5.0)
+
+
 def test_a_missing_mesh_at_the_end_of_a_leg_is_refused(tmp_path: Path) -> None:
     """The draft would stand on the other legs' feet alone."""
     file = urdf(tmp_path)

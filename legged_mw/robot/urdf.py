@@ -15,6 +15,7 @@ from legged_mw.utils.errors import ModelError
 
 _KNOWN = ("link", "joint", "material", "mujoco")  # elements for the reader; the rest is for other programs
 _COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "false"}
+_SPECK = 1e-9  # [kg] a lighter link has no mass
 SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
 
 
@@ -33,6 +34,8 @@ def read_urdf(source: XmlSource, notes: list[str], lost: dict[str, str]) -> tupl
     if mimics := [name for name, joint in joints.items() if joint.find("mimic") is not None]:
         notes.append(f"mimic dropped: {', '.join(mimics)} move by themselves")
     _drop_points(robot, file, notes)
+    _keep_one_material(robot, notes)
+    _drop_specks(robot, notes)
     files = _find_meshes(robot, file, notes, lost)
     extension = robot.find("mujoco")
     extension = ElementTree.SubElement(robot, "mujoco") if extension is None else extension
@@ -89,6 +92,29 @@ def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
             left_out.append(f"'{link.get('name')}'")
     if left_out:
         notes.append(f"looks left out (of size 0): those of link {', '.join(dict.fromkeys(left_out))}")
+
+
+def _keep_one_material(robot: Element, notes: list[str]) -> None:
+    """Keep the first material of each look: MuJoCo refuses a second one, which B2's exporter writes."""
+    with_more = [part for part in robot.iter("visual") if len(part.findall("material")) > 1]
+    for part in with_more:
+        for other in part.findall("material")[1:]:
+            part.remove(other)
+    if with_more:
+        notes.append(f"materials dropped: all but the first of {len(with_more)} looks")
+
+
+def _drop_specks(robot: Element, notes: list[str]) -> None:
+    """Drop masses that an exporter writes for a link of no size, 4e-15 kg in B2's: MuJoCo takes no moment below 1e-15."""
+    specks: list[str] = []
+    for link in robot.findall("link"):
+        inertial, mass = link.find("inertial"), link.find("inertial/mass")
+        with suppress(ValueError):  # MuJoCo reports text that is not a number
+            if inertial is not None and mass is not None and 0.0 < float(mass.get("value", "0")) < _SPECK:
+                link.remove(inertial)
+                specks.append(f"'{link.get('name')}'")
+    if specks:
+        notes.append(f"masses below {_SPECK:g} kg dropped: those of link {', '.join(specks)}")
 
 
 def _has_no_size(part: Element) -> bool:
