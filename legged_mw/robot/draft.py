@@ -275,7 +275,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
     rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
-    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.13)), "perturbation": dict(PUSHES), "rewards": rewards}
+    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.2)), "perturbation": dict(PUSHES), "rewards": rewards}
 
 
 def _energy(found: Draft) -> dict[str, float]:
@@ -287,7 +287,7 @@ def _energy(found: Draft) -> dict[str, float]:
 def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
     """Randomized worlds: what differs with the robot's size, and delays. ``shares`` of the mass, on the root."""
     mass = float(found.robot.physics.body_subtreemass[0])
-    return {"base_mass": [round(share * mass, 2) for share in shares], "delay_ms": [0.0, 15.0]}
+    return {"base_mass": [round(share * mass, 2) for share in shares], "delay_ms": [0.0, 20.0]}
 
 
 def _motors(found: Draft) -> dict[str, dict[str, float]]:
@@ -312,7 +312,7 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
         "pose_weights": table(pose_weights(robot, found.pose, found.feet, weights), robot.joint_names),
         "scales": dict(BY_CLOCK) if found.simple else {**LOOKS_OF_A_BIPED, **_energy(found)},
     }
-    worlds = _worlds(found, (-0.03, 0.14))
+    worlds = _worlds(found, (-0.03, 0.2))
     if not found.simple:
         ranges = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.4, 0.4], "ang_vel_yaw": [-1.0, 1.0]}
         return {"commands": {"ranges": ranges}, "domain_rand": worlds, "rewards": rewards}
