@@ -182,10 +182,7 @@ class UprightBipedCfg(BipedCfg):
 
     class rewards(BipedCfg.rewards):
         only_positive_rewards = False  # [ours: clipped at 0, these penalties outweigh all else and nothing is learned]
-        tracking_sigma, tracking_sigma_end = (
-            0.25,
-            0.15,
-        )  # wide: it marks time when told to walk slowly; 0.1: it turns badly
+        tracking_sigma, tracking_sigma_end = 0.25, 0.15  # wide to the end it steps on the spot; at 0.1 it turns badly
 
         class scales(BipedCfg.rewards.scales):
             tracking_lin_vel = 4.0  # with 2.0 it walks three quarters of the command
