@@ -291,13 +291,18 @@ def _frames(model: mujoco.MjModel, poses: Sequence[Floats]) -> list[NDArray[np.u
         renderer = mujoco.Renderer(model, height=HEIGHT, width=WIDTH)
     except Exception as error:  # each OpenGL backend raises another type
         raise ViewError(no_context(error)) from error
-    frames, tall = [], max(pose[2] for pose in poses)
+    data.qpos[:] = poses[0]
+    mujoco.mj_forward(model, data)
+    robot = np.flatnonzero(model.geom_bodyid)
+    tall = float(data.geom_xpos[robot, 2].max())
+    wide = 2.0 * float(np.linalg.norm(data.geom_xpos[robot, :2] - poses[0][:2], axis=1).max())
+    frames = []
     for azimuth in VIEWS.values():
         for pose in poses:
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
-            camera.lookat[:] = [pose[0], pose[1], 0.75 * tall]
-            camera.distance, camera.azimuth, camera.elevation = 1.6 * tall + 0.7, azimuth, -8.0
+            camera.lookat[:] = [pose[0], pose[1], 0.55 * tall]
+            camera.distance, camera.azimuth, camera.elevation = 1.5 * max(tall, wide) + 0.5, azimuth, -8.0
             mujoco.mjv_updateCamera(model, data, camera, renderer.scene)
             renderer.update_scene(data, camera, option)
             frames.append(renderer.render())
