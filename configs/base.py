@@ -177,7 +177,7 @@ class BipedCfgPPO(SimToRealCfgPPO):
 class UprightBipedCfg(BipedCfg):
     """A biped that walks upright: penalties count in full, and tracking outweighs them.
 
-    Numbers without a source: [ours: docs/your_own_robot.md, how the bipeds' recipe was found].
+    Numbers without a source: [ours: docs/archive/go2_and_g1.md, drafts on two feet].
     """
 
     class rewards(BipedCfg.rewards):
