@@ -87,6 +87,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
         begun = partial(watch_training, task)
     if not training.train(task, env, start, examine, export, args.deadline, args.verbose, begun):
         raise SystemExit(training.STOPPED)
+    print("".join(f"{line}\n" for line in examine.advice) if examine else "", end="", flush=True)
 
 
 @one_line_errors(fewer=FEWER_WORLDS)

@@ -61,6 +61,16 @@ def test_it_grades_and_draws_nothing_of_the_trainings_randomness() -> None:
     assert examine(lambda obs: torch.zeros(len(obs), 12)) == found
 
 
+def test_advice_names_what_is_beyond_the_marks() -> None:
+    rules = TrainingExam(load_task("go1_flat"), "cpu").rules
+    vx, vy, yaw = rules.marks
+    can, cannot, after = rules.advise([vx, vy, yaw], 0.0, 1.0)
+    assert can.count(";") >= 4 and cannot == "it cannot: -" and "--eval" in after
+    can, cannot, after = rules.advise([vx, 2.0 * vy, yaw], 3.0, 0.5)
+    assert "follow vy" in cannot and "stand at" in cannot and "pushes" in cannot and "--resume" in after
+    assert "follow vx" in can and "follow yaw" in can
+
+
 def test_no_exam_for_an_actor_that_sees_what_the_nominal_world_has_not(capsys: pytest.CaptureFixture[str]) -> None:
     task = load_task("go1_flat")
     for path, value in {"env.num_envs": 2, "domain_rand.enable": True, "domain_rand.observe": True}.items():

@@ -30,6 +30,7 @@ class Examiner(Protocol):
     """The exam during training: a call with a policy returns figures by name."""
 
     env: RobotTask
+    advice: list[str]  # lines on the policy that was graded last
 
     def __call__(self, policy: Policy) -> dict[str, float]: ...
 

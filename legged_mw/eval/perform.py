@@ -157,6 +157,7 @@ class InTraining:
         with rollout.keep_random_state(device):
             self.env = copied.env_class(copied.cfg, device, eager=eager)
         self._starts = self.skill.starts(machine(self.env), self.env.num_envs)
+        self.advice: list[str] = []  # the figures say it
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """The figures of ``first_part``."""

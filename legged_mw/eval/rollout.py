@@ -381,6 +381,7 @@ def motor_limits(env: LeggedRobot) -> figures.MotorLimits:
 
 TRAINING_SECONDS = 4.0  # [s] duration of the roll-out
 TRAINING_SETTLING = 2.0  # [s] at its start, without error measurement
+ERRORS = ("error_vx", "error_vy", "error_yaw")  # of the exam during training
 TRAINING_PUSH_AT = 1.0  # [s] time of the first of 16 pushes; a push is survived if the robot stands at the end
 
 
@@ -403,6 +404,7 @@ class TrainingExam:
         copy = copy_of(task)
         rules = ExamRules.from_config(copy.cfg)
         self.rules = replace(rules, push_speeds=(rules.push_mark,), transport_vx=rules.ranges[0][1])  # one of the 22
+        self.advice: list[str] = []
         prepare(copy, self.rules.worlds())
         with keep_random_state(device):
             self.env = copy.env_class(copy.cfg, device, eager=eager)
@@ -416,7 +418,10 @@ class TrainingExam:
         with keep_random_state(self.env.device):
             asked = cases(self.rules, dt, TRAINING_PUSH_AT)
             record = roll_out(self.env, policy, asked, round(TRAINING_SECONDS / dt), {"velocity": SIGNALS["velocity"]})
-        return training_figures(record, len(self.rules.commands()))
+        found = training_figures(record, len(self.rules.commands()))
+        errors = [found[name] for name in ERRORS]
+        self.advice = self.rules.advise(errors, found["falls"], found["pushes_survived"])
+        return found
 
 
 def training_figures(record: Record, count: int) -> dict[str, float]:
@@ -431,7 +436,7 @@ def training_figures(record: Record, count: int) -> dict[str, float]:
     believed = record.signals["estimate"][settled:, :count] if "estimate" in record.signals else velocity[..., :0]
     rms = np.sqrt(((believed - velocity[..., : believed.shape[-1]]) ** 2).mean(axis=(0, 1)))
     return {
-        **dict(zip(("error_vx", "error_vy", "error_yaw"), np.abs(missed).mean(axis=(0, 1)).tolist(), strict=True)),
+        **dict(zip(ERRORS, np.abs(missed).mean(axis=(0, 1)).tolist(), strict=True)),
         "falls": float((~stood[:count]).sum()),
         "pushes_survived": float(stood[count:].mean()),
         **dict(zip(("estimate_vx", "estimate_vy"), rms.tolist(), strict=False)),

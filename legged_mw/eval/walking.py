@@ -291,6 +291,29 @@ class ExamRules:
         small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
         return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
+    def advise(self, errors: Sequence[float], falls: float, survived: float) -> list[str]:
+        """What a policy can do, what it cannot, and what to try next, a line each, from the exam during training.
+
+        ``errors`` of vx, vy [m/s] and yaw rate [rad/s] are those of each step, sway included: a robot that is graded by
+        the mean velocity may be off by twice the mark. ``falls``: of 22; ``survived``: the share of the pushes.
+        """
+        most = [mark * (2.0 if self.marks_of == "offset" else 1.0) for mark in self.marks]
+        able = {"stand at all 22 commands": not falls, f"survive pushes of {self.push_mark:g} m/s": survived == 1.0}
+        for (axis, unit), error, limit in zip(AXES, errors, most, strict=True):
+            able[f"follow {axis} ({error:.2f} {unit} off; {limit:.2g} are allowed)"] = error <= limit
+        can, cannot = ([what for what, is_able in able.items() if is_able is asked] for asked in (True, False))
+        if not cannot:
+            after = "play.py --eval, the whole exam and the hard one"
+        elif falls or survived < 1.0:
+            after = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
+        else:
+            after = "train longer with --resume; play.py --eval says at which commands it is off"
+        return [
+            f"it can: {'; '.join(can) or 'nothing yet'}",
+            f"it cannot: {'; '.join(cannot) or '-'}",
+            f"next: {after}",
+        ]
+
     def beats_peer(self, result: Mapping[str, Any]) -> bool:
         """Whether the result is as good as each peer on every figure, and better on errors and cost of transport."""
         return all(_beats(result, peer.figures) for peer in self.peers)
