@@ -160,7 +160,7 @@ def test_both_languages_say_the_same(english: Path, chinese: Path) -> None:
 
 
 def test_which_pages_are_in_chinese() -> None:
-    assert {page.stem for _, page in TWINS[1:]} >= {"index", "concepts", "your_own_robot", "coming_from"}
+    assert {page.stem for _, page in TWINS[1:]} >= {"index", "concepts", "your_own_robot", "on_the_robot", "coming_from"}
 
 
 # ---- the README, pictures
