@@ -6,9 +6,11 @@ from legged_mw.utils.machine import settle
 
 start_quickly()  # before torch, as train.py does
 
+import shutil
 import signal
 from collections.abc import Iterator
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -48,10 +50,20 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # likewise `nohup make test`
 
 
+def has_browser() -> bool:
+    """Whether Chromium is there, and what drives it."""
+    return shutil.which("chromium") is not None and find_spec("playwright") is not None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect, not skip: `pytest -m gpu` on a machine without a GPU then says that nothing ran."""
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    for mark, present in (("gpu", gpus > 0), ("two_gpus", gpus > 1), ("display", has_display())):
+    for mark, present in (
+        ("gpu", gpus > 0),
+        ("two_gpus", gpus > 1),
+        ("display", has_display()),
+        ("browser", has_browser()),
+    ):
         if not present:
             without = [item for item in items if item.get_closest_marker(mark)]
             config.hook.pytest_deselected(items=without)

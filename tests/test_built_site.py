@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
+import shutil
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -38,6 +42,51 @@ def test_nothing_is_loaded_from_the_net(site: Path) -> None:
     assert [(page.name, found.group(0)) for page in pages for found in loads.finditer(page.read_text())] == []
     styles = [path for path in site.rglob("*.css") if re.search(r"url\(['\"]?(https?:)?//", path.read_text())]
     assert styles == []
+
+
+# the elements of a page that reach beyond the screen and do not scroll inside another one
+WIDE = """() => [...document.querySelectorAll(".md-content *")].filter(part => {
+    for (let box = part.parentElement; box && box !== document.body; box = box.parentElement)
+        if (["auto", "scroll", "hidden"].includes(getComputedStyle(box).overflowX)) return false;
+    const place = part.getBoundingClientRect();
+    return place.width > 0 && place.right > innerWidth + 1;
+}).map(part => part.tagName + " " + (part.textContent || "").slice(0, 60))"""
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Pages that are asked for are no news."""
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("width", [390, 1280])
+def test_pages_fit_a_phone_and_a_screen(width: int, site: Path) -> None:
+    """No page is wider than the screen [px], none writes an error to the console or asks another host."""
+    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
+
+    wrong: list[tuple[str, str]] = []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    home = f"http://127.0.0.1:{server.server_port}/"
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        here = ""
+        page.on("pageerror", lambda error: wrong.append((here, str(error))))
+        page.on("console", lambda said: wrong.append((here, said.text)) if said.type == "error" else None)
+        page.on(
+            "request",
+            lambda asked: None if asked.url.startswith((home, "data:", "blob:")) else wrong.append((here, asked.url)),
+        )
+        for file in sorted(site.rglob("*.html")):
+            here = str(file.relative_to(site))
+            page.goto(home + here)
+            wrong += [(here, part) for part in page.evaluate(WIDE)]
+            if page.evaluate("document.documentElement.scrollWidth") > width:
+                wrong.append((here, "wider than the screen"))
+        browser.close()
+    server.shutdown()
+    assert wrong == []
 
 
 def test_tables_are_made_from_the_code(site: Path) -> None:
@@ -160,7 +209,13 @@ def test_both_languages_say_the_same(english: Path, chinese: Path) -> None:
 
 
 def test_which_pages_are_in_chinese() -> None:
-    assert {page.stem for _, page in TWINS[1:]} >= {"index", "concepts", "your_own_robot", "on_the_robot", "coming_from"}
+    assert {page.stem for _, page in TWINS[1:]} >= {
+        "index",
+        "concepts",
+        "your_own_robot",
+        "on_the_robot",
+        "coming_from",
+    }
 
 
 # ---- the README, pictures

@@ -17,4 +17,5 @@ def on_page_content(content: str, **_: Any) -> str:
 
 
 def _mathml(latex: str, block: bool) -> str:
-    return convert(latex, display="block" if block else "inline")
+    tag, display = ("div", "block") if block else ("span", "inline")
+    return f'<{tag} class="formula">{convert(latex, display=display)}</{tag}>'  # site.css lets it scroll on a phone
