@@ -22,6 +22,7 @@ from legged_mw.motion.__main__ import main as motion
 from legged_mw.rl import flags, run_folder
 from legged_mw.sim import terrain
 from legged_mw.view import playing
+from website import reference
 
 PAGES = [
     *sorted(ROOT.glob("README*.md")),
@@ -192,5 +193,12 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
 def test_a_page_is_short(page: Path) -> None:
-    """The tutorial is a course; of all others a reader in a hurry finds what is asked for."""
-    assert page.name == "tutorial.md" or len(page.read_text().splitlines()) <= 250
+    """The tutorial is a course, two are tables to look up in; of all others a reader in a hurry finds what is asked for."""
+    assert page.name in ("tutorial.md", *reference.PAGES) or len(page.read_text().splitlines()) <= 250
+
+
+@pytest.mark.parametrize("name", reference.PAGES)
+def test_tables_are_what_the_code_makes(name: str) -> None:
+    """If not: `python -m website.reference`."""
+    page = (ROOT / "docs" / name).read_text()
+    assert reference.renew(page) == page and page.count("\n| `") > 100

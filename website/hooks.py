@@ -1,4 +1,4 @@
-"""mkdocs hooks: links that leave docs/ lead to pages of the site, and `<!-- made: NAME -->` becomes a table made from the code."""
+"""mkdocs hooks: links that leave docs/ lead to pages of the site, and `<!-- made: policy_NAME -->` becomes a chapter of the gallery."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files, InclusionLevel
 
 ROOT = Path(__file__).resolve().parent.parent
 
-MARK = re.compile(r"<!-- made: (\w+) -->")
+MARK = re.compile(r"<!-- made: policy_(\w+) -->")
 LINK = re.compile(r"(\]\()([^)\s]+)(\))")
 ARCHIVED = re.compile(r"\[([^\]]+)\]\(archive/[^)\s]+\)")  # in the repository alone: the link's text is the path
 FENCE = re.compile(r"(^```.*?^```$|`[^`\n]+`)", re.MULTILINE | re.DOTALL)
@@ -28,10 +28,7 @@ def targets(path: Path) -> list[Path]:
     """Files and folders that a page links to, its code left out."""
     parts = FENCE.split(path.read_text())
     links = [link for part in parts[::2] for _, link, _ in LINK.findall(part) if not outside(link)]
-    curves = [
-        f"../resources/policies/{name}/curve.webp"
-        for name in re.findall(r"<!-- made: policy_(\w+) -->", path.read_text())
-    ]
+    curves = [f"../resources/policies/{name}/curve.webp" for name in MARK.findall(path.read_text())]
     return [(path.parent / link.partition("#")[0]).resolve() for link in [*links, *curves]]
 
 
@@ -93,7 +90,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         there = page_of((source.parent / name).resolve())
         return f"{before}{os.path.relpath(there, os.path.dirname(here) or '.')}{mark}{anchor}{after}"
 
-    markdown = MARK.sub(lambda found: made(found.group(1)), markdown)
+    markdown = MARK.sub(lambda found: chapter(found[1]), markdown)
     if source.suffix == ".md" and source.exists():
         parts = FENCE.split(ARCHIVED.sub(r"`\1`", markdown))
         markdown = "".join(part if i % 2 else LINK.sub(relinked, part) for i, part in enumerate(parts))
@@ -115,8 +112,9 @@ def twin(here: str) -> str:
     return f"[{'English' if chinese else '中文'}]({'../' if chinese else 'zh/'}{name}){{ .language }}\n\n"
 
 
-def made(name: str) -> str:
+def chapter(name: str) -> str:
+    """The gallery's chapter on a policy."""
     sys.path.insert(0, str(ROOT))  # mkdocs loads this file by its path
-    from website import gallery, reference  # imports torch
+    from website import gallery
 
-    return gallery.chapter(name.removeprefix("policy_")) if name.startswith("policy_") else reference.MADE[name]()
+    return gallery.chapter(name)

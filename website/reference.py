@@ -11,6 +11,7 @@ import re
 import textwrap
 import tokenize
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from configs import base
@@ -318,4 +319,23 @@ def config_fields() -> str:
     return "\n\n".join(parts)
 
 
-MADE = {"rewards": rewards, "observations": observations, "config": config_fields}  # what `<!-- made: NAME -->` becomes
+MADE = {"rewards": rewards, "observations": observations, "config": config_fields}  # what `<!-- made: NAME -->` heads
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGES = ("rewards.md", "config.md")  # of DOCS, which hold such tables
+_TABLES = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def renew(page: str) -> str:
+    """The text of a page with its tables made again from the code."""
+    return _TABLES.sub(lambda found: f"{found[1]}\n{MADE[found[2]]()}\n\n{found[3]}", page)
+
+
+def main() -> None:
+    """Write the tables of ``PAGES`` again: ``python -m website.reference``, after a term, a row or a field changed."""
+    for name in PAGES:
+        page = DOCS / name
+        page.write_text(renew(page.read_text()))
+
+
+if __name__ == "__main__":
+    main()
