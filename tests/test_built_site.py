@@ -221,7 +221,7 @@ def test_which_pages_are_in_chinese() -> None:
 
 
 def test_the_readme_is_short() -> None:
-    assert all(len(page.read_text().splitlines()) <= 120 for page in TWINS[0])
+    assert all(len(page.read_text().splitlines()) <= 80 for page in TWINS[0])
 
 
 def test_pictures_are_small() -> None:

@@ -20,16 +20,7 @@ ORDER = (  # then all others by name
     *("go1_flat", "go1_rough", "go1_rough_scan", "go1_rough_student", "go2_flat", "go2_rough", "go2_rough_scan"),
     *("g1_flat", "g1_12dof_flat", "g1_rough"),
 )
-HEAD = """# Gallery
-
-Every policy that ships, in MuJoCo's C engine. `MUJOCO_GL=egl python -m website.gallery` makes this page, its films and
-stills from `resources/policies/`. To watch one and drive it:
-
-```bash
-python play.py --task g1_flat --load_run shipped
-python -m legged_mw.deploy go2_rough --terrain        # without torch, among stairs and blocks
-```
-"""
+FIRST = f"\n## {ORDER[0]}\n"  # what stands before it in docs/gallery.md is written by hand
 
 
 def policies() -> list[str]:
@@ -40,7 +31,8 @@ def policies() -> list[str]:
 
 def page() -> str:
     """The whole of docs/gallery.md; the site writes what the policy's README says where the marks are."""
-    return "\n".join([HEAD, *map(_entry, policies())])
+    head = PAGE.read_text().partition(FIRST)[0]
+    return "\n".join([head, *map(_entry, policies())])
 
 
 def _entry(name: str) -> str:
