@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -182,6 +183,18 @@ def test_the_rule_of_gains_is_near_what_makers_publish() -> None:
             [gains] = suggest([joint], moment)
             near += [abs(math.log(gains.kp / kp)) < math.log(2.0), abs(math.log(gains.kd / kd)) < math.log(2.0)]
     assert sum(near) >= 0.75 * len(near) and len(near) == 40
+
+
+@pytest.mark.parametrize(("kp", "stands"), [(20.0, True), (8.0, False)])
+def test_gains_on_which_a_quadruped_sinks_are_not_taken(
+    kp: float, stands: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A1's of 20 N m/rad hold it up; a B2 learned nothing with those of its maker."""
+    maker = replace(next(each for each in read_makers() if each.name == "a1"), kp={"": kp})
+    monkeypatch.setattr(makers, "read_makers", lambda: [maker])
+    found = draft(ROOT / "tests/data/a1_style.urdf")
+    assert ({gain.kp for gain in found.gains} == {kp}) == stands
+    assert found.gains_from.endswith("sinks") != stands and maker.source in found.gains_from
 
 
 def test_every_gain_has_its_damping() -> None:

@@ -154,7 +154,8 @@ def _servos(
 ) -> tuple[list[Gains], str]:
     """Gains of each joint, and where they come from: the maker's, else as suggested, else firmer.
 
-    On more than two feet they are the smallest of FIRMNESS on which the robot stands. A biped falls on any.
+    On more than two feet the robot must stand on them: else the maker's are not taken, and of FIRMNESS the smallest on
+    which it does. A biped falls on any.
     """
     names = robot.joint_names
     kp, kd = (maker.of(table, names) if maker else {} for table in ("kp", "kd"))
@@ -165,9 +166,11 @@ def _servos(
         suggested = zip(names, suggest(joints, moment, firmness), strict=True)
         return [known.get(name, gains) for name, gains in suggested]
 
-    if maker and len(known) == len(names):
-        return chosen(1.0), f"its maker's, {maker.source}"
     some = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
+    if maker and len(known) == len(names):
+        if len(feet) <= 2 or _stands(robot, pose, place, joints, feet, chosen(1.0)):
+            return chosen(1.0), f"its maker's, {maker.source}"
+        known, some = {}, f"; with its maker's, {maker.source}, it sinks"
     for firmness in FIRMNESS if len(feet) > 2 else ():
         if _stands(robot, pose, place, joints, feet, chosen(firmness)):
             firmer = f"{firmness:g} times what is suggested below, to stand on its servos"
