@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from legged_mw.deploy.__main__ import find
-from legged_mw.deploy.contract import CONTRACT_FILE, read_contract
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, read_contract
 from legged_mw.deploy.exam import contract_rules, contract_skill, run_exam, run_skill
 from legged_mw.deploy.hard_exam import run_hard
 from legged_mw.eval import hard, walking
@@ -51,6 +51,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="of a run (default: the newest)")
     common = "of a walk: the ranges that were trained, or those that published policies of the robot were asked"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
+    parser.add_argument("--scene", metavar="FILE", help="of a walk: in this MJCF of yours, such as a vendor's own")
     parser.add_argument("--no_hard", action="store_true", help="without the hard exam, in half of the time")
     parser.add_argument("--edited", action="store_true", help="a contract that was changed, or written by hand")
     args = parser.parse_args()
@@ -122,19 +123,20 @@ def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     contract = read_contract(folder, args.edited)
     section = dict(contract.exam or {})
     if "kind" in section:
-        if args.ranges:
-            raise UserError("--ranges says what the walking exam asks: leave it out")
+        if flag := "--ranges" if args.ranges else "--scene" if args.scene else "":
+            raise UserError(f"{flag} is of the walking exam, and {folder} has another one: leave it out")
         exam = {"kind": section["kind"], "rules": vars(contract_skill(contract))}
     else:
         rules = contract_rules(contract, args.ranges == "common")
         exam = {"kind": "walking", "hard": bool(contract.feet) and not args.no_hard, "rules": rules.to_mapping()}
+        exam |= {"scene": typed(args.scene).name} if args.scene else {}
     said = {"exam": {**exam, "version": VERSION}, "robot": {"joints": list(contract.joints)}}
     return json.loads(json.dumps(said))  # as a file has it: lists, no tuples
 
 
 def check_alike(asked: Mapping[str, Any], other: Mapping[str, Any], name: str, against: str) -> None:
     """Raise UserError if two results are not of one exam and one robot."""
-    for place in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "hard", "rules"))):
+    for place in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "scene", "hard", "rules"))):
         mine, theirs = (said[place[0]].get(place[1]) for said in (asked, other))
         if mine != theirs:
             if isinstance(mine, dict) and isinstance(theirs, dict):
@@ -194,11 +196,11 @@ def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Names
             figure._replace(name=f"{part}: {figure.name}") for part in parts for figure in skill.figures(parts, part)
         ]
         return Graded({"passes": result["passed"]}, [figure for figure in each if figure.mark is not None])
-    rules = ExamRules.from_mapping(exam["rules"])
-    result = run_exam(folder, rules, edited=args.edited, seed=seed)
+    rules, scene = ExamRules.from_mapping(exam["rules"]), typed(args.scene) if args.scene else SCENE_FILE
+    result = run_exam(folder, rules, edited=args.edited, scene=scene, seed=seed)
     said, figures = {"walks": result["walks"]}, rules.figures(result)
     if exam["hard"]:
-        harder, _ = run_hard(folder, rules, result["walks"], args.edited, seed=seed)
+        harder, _ = run_hard(folder, rules, result["walks"], args.edited, scene, seed)
         said["ready for a robot"] = harder["ready"]
         figures += [*condition_figures(harder), *hard.figures(harder)]
     return Graded(said, [figure for figure in figures if figure.mark is not None])
