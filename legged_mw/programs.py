@@ -1,4 +1,4 @@
-"""The programs: legged-mw train, play, deploy and robot. train.py and play.py of a clone are the first two.
+"""The programs: legged-mw train, play, deploy, exam, robot and tools. train.py and play.py of a clone are the first two.
 
 Each imports what it needs when it starts: deploy also runs where torch is not installed.
 """
@@ -156,6 +156,21 @@ def deploy() -> None:
         main()
 
 
+def exam() -> None:
+    """Grade a policy, and compare with an earlier result. A run that has no export is exported first."""
+    from legged_mw.deploy.gate import main
+
+    def make(name: str, checkpoint: int, folder: Path) -> None:
+        from legged_mw.rl.policies import find_trained
+        from legged_mw.rl.run_folder import logs_folder
+
+        source, task = find_trained(name, logs_folder(), "exam", checkpoint=checkpoint)
+        export(task, source.checkpoint, folder)
+
+    with one_line_errors(fewer=FEWER_WORLDS):
+        main(make)
+
+
 def robot() -> None:
     """A robot's health page, and a first task for it."""
     from legged_mw.robot.__main__ import main
@@ -186,6 +201,7 @@ PROGRAMS: dict[str, Callable[[], None]] = {
     "train": train,
     "play": play,
     "deploy": deploy,
+    "exam": exam,
     "robot": robot,
     "motion": _tool("legged_mw.motion.__main__"),
     "doctor": _tool("legged_mw.tools.doctor"),
@@ -198,6 +214,7 @@ HELP = """legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help
   train       train a task: legged-mw train --task go1_flat
   play        watch, grade or export a policy
   deploy      run an exported policy without torch
+  exam        grade a policy, and compare with an earlier result
   robot       a robot's health page, and a first task for it
   motion      read and look at reference motions
   doctor      what this machine has, lacks and how fast it trains

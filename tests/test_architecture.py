@@ -81,12 +81,13 @@ ONLY_IN = {
         "legged_mw/motion/look.py",
     ],
     "legged_mw.motion": ["legged_mw/motion/*"],
-    "legged_mw.unitree": ["legged_mw/unitree/*"],  # deploy finds it by name
+    "legged_mw.unitree": ["legged_mw/unitree/*", "examples/unitree_rl_lab.py"],  # deploy finds it by name
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.tools": ["legged_mw/tools/*", "legged_mw/programs.py"],
     "legged_mw.deploy": [
         *("legged_mw/deploy/*", "legged_mw/unitree/*", "legged_mw/export/*", "legged_mw/programs.py"),
         "examples/udp_robot.py",
+        "examples/unitree_rl_lab.py",
     ],
     "legged_mw.export": ["legged_mw/export/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py"],

@@ -30,7 +30,10 @@ PAGES = [
     *sorted(page for page in (ROOT / "docs").rglob("*.md") if page.parent.name != "archive"),  # frozen, word for word
     *sorted((ROOT / "resources").rglob("*.md")),
 ]
-ELSEWHERE = {"your_own_robot.md": "tests/test_your_own_robot.py runs its commands, one after the other"}
+ELSEWHERE = {
+    "gate.md": "exams of half a minute, a file of others: test_gate.py",
+    "your_own_robot.md": "tests/test_your_own_robot.py runs its commands, one after the other",
+}
 # pattern of a command -> why no test runs it as it stands; those of our programs have their flags read all the same
 WHY_NOT = {
     r"^(pip|pipx|uvx|docker|eval|apt|source|make|tensorboard|git|sudo)\b": "sets up a machine; CI itself is make lint and make test",

@@ -165,6 +165,8 @@ def parse() -> argparse.Namespace:
         action="store_true",
         help="you changed what is exported: each number is shown beside the exported one",
     )
+    unitree = "write the policy for unitree_rl_lab's program: OUT/params/deploy.yaml and OUT/exported/policy.onnx"
+    parser.add_argument("--deploy_yaml", metavar="OUT", help=unitree)
     launch.add_flags(parser)
     add_flags(parser)
     drive.add_flags(parser)
@@ -216,7 +218,9 @@ def main() -> None:
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     contact = contact_source(args, contract)
-    if args.switch:
+    if args.deploy_yaml:
+        print(import_module("legged_mw.unitree.deploy_yaml").write(folder, contract, typed(args.deploy_yaml)))
+    elif args.switch:
         stage = SwitchStage(folder, find(args.second), args.num_envs, command, args.edited)
         launch.watch(stage, args, results(folder), title=f"{contract.task}, {args.second}")
     elif args.serve:

@@ -45,11 +45,12 @@ def run_exam(
     contact: str | None = None,
     edited: bool = False,
     scene: str | Path = SCENE_FILE,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by its contract. Raises ContractError, ConfigError.
 
     ``common``: the contract's rules, but with the command range shared by all published policies of the robot.
-    ``contact``, ``edited`` and ``scene``, its ``scene_file``: see DeployStage.
+    ``contact``, ``edited`` and ``scene``, its ``scene_file``: see DeployStage. ``seed``: of the start, see ``scatter``.
     """
     contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
@@ -60,6 +61,7 @@ def run_exam(
     stage = DeployStage(
         folder, len(wanted), threads=threads, scene_file=scene, ends=ends, contact=contact, edited=edited
     )
+    stage.scatter(seed)
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(walking.EXAM_SECONDS / stage.dt)):
@@ -78,11 +80,17 @@ def run_exam(
     )
 
 
-def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False) -> dict[str, Any]:
-    """Grade the export in ``folder`` by ``skill``, else by the skill in its contract. ``edited``: see DeployStage."""
+def run_skill(
+    folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False, seed: int = 0
+) -> dict[str, Any]:
+    """Grade the export in ``folder`` by ``skill``, else by the skill in its contract.
+
+    ``edited``: see DeployStage. ``seed``: of the start, see ``scatter``.
+    """
     skill = skill or contract_skill(read_contract(folder, edited))
+    grounds = skill.grounds.items()
     return skill.result(
-        {name: skill.judge(*perform(folder, skill, ground, threads, edited)) for name, ground in skill.grounds.items()}
+        {name: skill.judge(*perform(folder, skill, ground, threads, edited, seed)) for name, ground in grounds}
     )
 
 
@@ -96,7 +104,7 @@ def contract_skill(contract: Contract) -> Skill:
 
 
 def perform(
-    folder: Path, skill: Skill, ground: ExamGround, threads: int = 0, edited: bool = False
+    folder: Path, skill: Skill, ground: ExamGround, threads: int = 0, edited: bool = False, seed: int = 0
 ) -> tuple[ExamRobot, Recording]:
     """Put robots into their starts on ``ground`` and run the policy."""
     stage = DeployStage(
@@ -107,6 +115,7 @@ def perform(
     robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
     if starts := skill.starts(robot, skill.robots):
         stage.put(*starts)
+    stage.scatter(seed)
     steps = []
     ended_at = np.full(skill.robots, math.inf)
     for step in range(skill.steps(robot)):

@@ -29,16 +29,17 @@ SEED = 1  # of the noise
 
 
 def run_hard(
-    folder: Path, rules: ExamRules, walks: bool, edited: bool = False, scene: str | Path = SCENE_FILE
+    folder: Path, rules: ExamRules, walks: bool, edited: bool = False, scene: str | Path = SCENE_FILE, seed: int = 0
 ) -> tuple[dict[str, Any], list[Floats]]:
     """The hard exam's result, and qpos (nq,) of the robot at PICTURES moments of a stride; none if it fell.
 
-    ``walks``: by the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. Raises ContractError, UserError.
+    ``walks``: by the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. ``seed``: of the noise, and of
+    the start (see ``scatter``). Raises ContractError, UserError.
     """
     contract = read_contract(folder, edited)
     load = hard.load_of(rules, contract.mass)
-    conditions = run_conditions(folder, contract, rules, load, edited, scene)
-    walk, poses = look(folder, contract, rules, edited, scene)
+    conditions = run_conditions(folder, contract, rules, load, edited, scene, seed)
+    walk, poses = look(folder, contract, rules, edited, scene, seed)
     found = hard.looks(walk) if walk else None
     return hard.finish(rules, walks, conditions, found, len(contract.feet), load), poses
 
@@ -53,6 +54,7 @@ def run_conditions(
     load: float,
     edited: bool = False,
     scene: str | Path = SCENE_FILE,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Condition -> falls, errors, drift and pushes; each condition has its own range of worlds."""
     asked = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
@@ -60,7 +62,8 @@ def run_conditions(
     wanted = commands_of(contract, asked * len(CONDITIONS))
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
     stage = DeployStage(folder, count, ends=ends, scene_file=scene, edited=edited)
-    apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(asked)), load)
+    stage.scatter(seed)
+    apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(asked)), load, seed)
     fell_at, velocity, position = np.full(count, math.inf), [], []
     for step in range(round(hard.SECONDS / stage.dt)):
         velocity.append(stage.velocity())
@@ -83,7 +86,7 @@ def commands_of(contract: Contract, velocities: Sequence[Sequence[float]]) -> Fl
     return wanted
 
 
-def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float) -> None:
+def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float, seed: int = 0) -> None:
     """Give world i the condition ``CONDITIONS[which[i]]``; ``load`` [kg] is added to the heaviest body."""
     fleet = stage.fleet
     fleet.set_delay(np.array([each.delay / 1000.0 for each in CONDITIONS])[which])
@@ -91,7 +94,10 @@ def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float) 
     fleet.add_load(trunk_of(fleet.model), np.array([load * each.loaded for each in CONDITIONS])[which])
     friction = [math.nan if each.friction is None else each.friction for each in CONDITIONS]
     fleet.set_friction(np.array(friction)[which])
-    noisy, random = np.array([float(each.noisy) for each in CONDITIONS])[which][:, None], np.random.default_rng(SEED)
+    noisy, random = (
+        np.array([float(each.noisy) for each in CONDITIONS])[which][:, None],
+        np.random.default_rng(SEED + seed),
+    )
 
     def disturb(measured: Measurement) -> Measurement:
         shapes = {name: getattr(measured, name).shape for name in NOISE}
@@ -121,7 +127,12 @@ def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
 
 
 def look(
-    folder: Path, contract: Contract, rules: ExamRules, edited: bool = False, scene: str | Path = SCENE_FILE
+    folder: Path,
+    contract: Contract,
+    rules: ExamRules,
+    edited: bool = False,
+    scene: str | Path = SCENE_FILE,
+    seed: int = 0,
 ) -> tuple[Walk | None, list[Floats]]:
     """A walk straight ahead at half of the highest vx, and poses of one stride; None if the robot falls."""
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
@@ -136,7 +147,8 @@ def look(
         edited=edited,
         each=lambda: witness[0].sample(),
     )
-    witness.append(Witness(stage.fleet))
+    witness.append(Witness(stage.fleet))  # feet stand level in the pose of the scene
+    stage.scatter(seed)
     wanted = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
     targets, poses, settled = [], [], round(hard.SETTLING / stage.dt)
     for step in range(round(LOOK_SECONDS / stage.dt)):

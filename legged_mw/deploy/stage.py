@@ -16,6 +16,7 @@ from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Change, Fleet
 
+SCATTER = 0.05  # [rad] largest difference of a joint from its start, where a seed asks for it [ours]
 STROLL = {"lin_vel_x": 0.5}  # [m/s] without a command: a walking robot shows more than a standing one
 
 
@@ -121,6 +122,13 @@ class DeployStage:
         self.fleet.refresh()
         self._forget(slice(None))
         self.measured = self.fleet.read()
+
+    def scatter(self, seed: int) -> None:
+        """Turn each joint by up to SCATTER, drawn from ``seed``, and start again. Seed 0: nothing moves."""
+        if seed:
+            joints = self.fleet.qpos.shape[1] - 7
+            turned = np.random.default_rng(seed).uniform(-SCATTER, SCATTER, (self.num_worlds, joints))
+            self.put(self.qpos() + np.pad(turned, ((0, 0), (7, 0))), self.fleet.qvel.copy())
 
     def reset(self, world: int) -> None:
         """Put the robot back to the start, at rest."""

@@ -83,7 +83,9 @@ class Trained(NamedTuple):
     task: LoadedTask
 
 
-def find_trained(name: str, experiment: Path, flag: str, learner: LoadedTask | None = None) -> Trained:
+def find_trained(
+    name: str, experiment: Path, flag: str, learner: LoadedTask | None = None, checkpoint: int = -1
+) -> Trained:
     """The policy that a flag names: a file, a run of ``experiment`` or at a path, an export, a task, or TASK/RUN.
 
     Its task is one of the project, or in a file that the task of the ``learner`` is or extends.
@@ -93,9 +95,9 @@ def find_trained(name: str, experiment: Path, flag: str, learner: LoadedTask | N
         if path.is_file():
             source = PolicySource(path.parent, path, shipped=False)
         elif task in task_names():
-            source = find_policy(load_task(task), run or None)
+            source = find_policy(load_task(task), run or None, checkpoint)
         else:
-            source = _run_or_export(experiment, name)
+            source = _run_or_export(experiment, name, checkpoint)
         return Trained(source, load_trained(task_of(source.folder, learner), source))
     except ConfigError as error:
         raise ConfigError(

@@ -1,0 +1,368 @@
+"""legged-mw exam POLICY ...: grade policies over several seeds, and compare with an earlier result of the same exam.
+
+The physics is MuJoCo's C engine and the policy is an export, so neither torch nor a GPU is needed. Exit code 1: a mark fell.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import fmean
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from legged_mw.deploy.__main__ import find
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, read_contract
+from legged_mw.deploy.exam import contract_rules, contract_skill, run_exam, run_skill
+from legged_mw.deploy.hard_exam import run_hard
+from legged_mw.eval import hard, walking
+from legged_mw.eval.walking import ExamRules, Figure
+from legged_mw.utils.cli import Parser, positive
+from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import typed, writable
+from legged_mw.utils.machine import usable_cores
+
+VERSION = 1  # of the exams: raise it when a figure changes its meaning, so that no two meanings are compared
+SEEDS = 3
+# A mark falls when its mean is worse than the stored one by more than the largest of: SPREAD times the range of the stored
+# repeats, the range of the new ones, SHARE of the stored mean, LEAST of the mark. Of 110 comparisons each of go2_flat and
+# g1_flat with themselves, three repeats a side, 3 and 1 were false alarms.
+SPREAD, SHARE, LEAST = 2.0, 0.1, 0.02
+FELL = 1  # exit code
+
+Export = Callable[[str, int, Path], None]  # a run's name, a checkpoint's iteration or -1, a folder to export to
+
+
+def parse() -> argparse.Namespace:
+    parser = Parser(prog="legged-mw exam", description=__doc__, allow_abbrev=False)
+    what = "an export, a run, TASK/RUN, or a task for its last run; several: trainings that count as repeats"
+    parser.add_argument("policies", metavar="POLICY", nargs="+", help=what)
+    parser.add_argument("--against", metavar="FILE", help="a result to compare with; exit code 1 if a mark fell")
+    parser.add_argument("--json", metavar="FILE", help="where the result goes")
+    parser.add_argument("--badge", metavar="FILE", help="an SVG that says whether it walks")
+    seeds = f"repeats, each with its own starts and noise (default: {SEEDS})"
+    parser.add_argument("--seeds", type=positive, default=SEEDS, metavar="N", help=seeds)
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="the first seed; 0 starts without scatter")
+    parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="of a run (default: the newest)")
+    common = "of a walk: the ranges that were trained, or those that published policies of the robot were asked"
+    parser.add_argument("--ranges", choices=("trained", "common"), help=common)
+    parser.add_argument("--scene", metavar="FILE", help="of a walk: in this MJCF of yours, such as a vendor's own")
+    parser.add_argument("--no_hard", action="store_true", help="without the hard exam, in half of the time")
+    parser.add_argument("--edited", action="store_true", help="a contract that was changed, or written by hand")
+    args = parser.parse_args()
+    if args.seed < 0:
+        parser.error(f"--seed {args.seed}: a seed is 0 or more")
+    for flag in ("json", "badge"):
+        if getattr(args, flag) is not None:
+            writable(getattr(args, flag), f"--{flag}")
+    return args
+
+
+def main(export: Export) -> None:
+    """The program. ``export`` makes an export of a run that has none, which needs torch."""
+    args = parse()
+    before = read_result(typed(args.against)) if args.against else None
+    with TemporaryDirectory() as place:
+        folders = [
+            find_export(name, args.checkpoint) or _exported(export, name, args.checkpoint, Path(place, str(i)))
+            for i, name in enumerate(args.policies)
+        ]
+        asked = [asked_of(folder, args) for folder in folders]
+        for name, other in zip(args.policies[1:], asked[1:], strict=True):
+            check_alike(other, asked[0], name, args.policies[0])
+        if before:
+            check_alike(asked[0], before, args.policies[0], args.against)
+        result = examine(folders, asked[0], args)
+    marks = fallen(result, before) if before else []
+    print(table(result, before))
+    if args.json:
+        walking.save(result, typed(args.json))
+        print(f"written to {shown(typed(args.json))}")
+    if args.badge:
+        typed(args.badge).write_text(badge(result), encoding="utf-8")
+    for line in marks:
+        print(f"fell: {line}")
+    if marks:
+        raise SystemExit(FELL)
+    if before:
+        print("no mark fell")
+
+
+def find_export(name: str, checkpoint: int = -1) -> Path | None:
+    """The export called ``name``: its folder, that of a run that exported itself, or one that ships. None: a run has none."""
+    folder = typed(name)
+    if checkpoint == -1:
+        for path in (folder, folder / "export"):
+            if (path / CONTRACT_FILE).is_file():
+                return find(str(path))
+    return None if folder.exists() or Path("logs", name).exists() or checkpoint != -1 else _shipped(name)
+
+
+def _shipped(name: str) -> Path | None:
+    try:
+        return find(name)
+    except UserError:  # perhaps a run: the caller says what there is
+        return None
+
+
+def _exported(export: Export, name: str, checkpoint: int, folder: Path) -> Path:
+    export(name, checkpoint, folder)
+    return folder
+
+
+# ---- what is asked ----------------------------------------------------------------------------------------------------
+
+
+def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """What an export will be asked, and of which robot: two results are compared only if all of it is equal."""
+    contract = read_contract(folder, args.edited)
+    section = dict(contract.exam or {})
+    if "kind" in section:
+        if flag := "--ranges" if args.ranges else "--scene" if args.scene else "":
+            raise UserError(f"{flag} is of the walking exam, and {folder} has another one: leave it out")
+        exam = {"kind": section["kind"], "rules": vars(contract_skill(contract))}
+    else:
+        rules = contract_rules(contract, args.ranges == "common")
+        exam = {"kind": "walking", "hard": bool(contract.feet) and not args.no_hard, "rules": rules.to_mapping()}
+        exam |= {"scene": typed(args.scene).name} if args.scene else {}
+    said = {"exam": {**exam, "version": VERSION}, "robot": {"joints": list(contract.joints)}}
+    return json.loads(json.dumps(said))  # as a file has it: lists, no tuples
+
+
+def check_alike(asked: Mapping[str, Any], other: Mapping[str, Any], name: str, against: str) -> None:
+    """Raise UserError if two results are not of one exam and one robot."""
+    for place in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "scene", "hard", "rules"))):
+        mine, theirs = (said[place[0]].get(place[1]) for said in (asked, other))
+        if mine != theirs:
+            if isinstance(mine, dict) and isinstance(theirs, dict):
+                key = next(key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key))
+                place, mine, theirs = (*place, key), mine.get(key), theirs.get(key)
+            what = f"{': '.join(place)} is {_short(mine)} of {name} and {_short(theirs)} of {against}"
+            raise UserError(f"{what}: one exam of one robot is compared; write a new result with --json FILE")
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+# ---- grading ----------------------------------------------------------------------------------------------------------
+
+
+class Graded(NamedTuple):
+    """One repeat of the exam."""
+
+    verdicts: dict[str, bool]
+    figures: list[Figure]  # those with a mark
+
+
+def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """Grade all exports with all seeds. The result is for JSON."""
+    repeats, seeds = [], range(args.seed, args.seed + args.seeds)
+    for name, folder in zip(args.policies, folders, strict=True):
+        for seed in seeds:
+            repeats.append(graded := grade(folder, asked["exam"], seed, args))
+            words = ", ".join(f"{word}: {'yes' if yes else 'no'}" for word, yes in graded.verdicts.items())
+            print(f"{name}, seed {seed}: {words}", flush=True)
+    contracts = [read_contract(folder, args.edited) for folder in folders]
+    return {
+        **asked,
+        "task": contracts[0].task,
+        "policies": [
+            {"policy": name, "sha256": contract.digest} for name, contract in zip(args.policies, contracts, strict=True)
+        ],
+        "seeds": list(seeds),
+        "engine": f"MuJoCo {_version('mujoco')}, C engine",
+        "legged_mw": _version("legged_mw"),
+        "commit": commit(),
+        "machine": machine(),
+        "verdicts": {word: [each.verdicts[word] for each in repeats] for word in repeats[0].verdicts},
+        "marks": marks_of([each.figures for each in repeats]),
+    }
+
+
+def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Namespace) -> Graded:
+    """One repeat."""
+    if exam["kind"] != "walking":
+        skill = contract_skill(read_contract(folder, args.edited))
+        result = run_skill(folder, skill, edited=args.edited, seed=seed)
+        parts = result["parts"]
+        each = [
+            figure._replace(name=f"{part}: {figure.name}") for part in parts for figure in skill.figures(parts, part)
+        ]
+        return Graded({"passes": result["passed"]}, named(each))
+    rules, scene = ExamRules.from_mapping(exam["rules"]), typed(args.scene) if args.scene else SCENE_FILE
+    result = run_exam(folder, rules, edited=args.edited, scene=scene, seed=seed)
+    said, figures = {"walks": result["walks"]}, rules.figures(result)
+    if exam["hard"]:
+        harder, _ = run_hard(folder, rules, result["walks"], args.edited, scene, seed)
+        said["ready for a robot"] = harder["ready"]
+        figures += [*condition_figures(harder), *hard.figures(harder)]
+    return Graded(said, named(figures))
+
+
+def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
+    """The marks of the hard exam's conditions."""
+    falls = sum(each["falls"] for each in result["conditions"].values())
+    return [
+        Figure("falls in commands under conditions", falls, 0, 0),
+        Figure("pushes under all survived", result["conditions"][hard.ALL]["pushes"], 2, hard.PUSHES, None, True),
+        Figure("falls while it is looked at", float(result["looks"] is None), 0, 0),
+    ]
+
+
+def named(figures: Sequence[Figure]) -> list[Figure]:
+    """The figures with a mark. An indented row of a table gets the name of the row above it too, so that names are unique."""
+    found, above = [], ""
+    for figure in figures:
+        above = above if figure.name.startswith(" ") else figure.name
+        name = f"{above}, {figure.name.strip()}" if figure.name.startswith(" ") else figure.name
+        found += [figure._replace(name=name)] if figure.mark is not None else []
+    return found
+
+
+def marks_of(repeats: Sequence[Sequence[Figure]]) -> list[dict[str, Any]]:
+    """Each mark with the mean, the worst and all values of the repeats, and the tolerance that follows from them."""
+    marks = []
+    for name, figure in {figure.name: figure for each in repeats for figure in each}.items():
+        values = [each.value for figures in repeats for each in figures if each.name == name]
+        known = [float(value) for value in values if value is not None]
+        mean, spread = fmean(known or [0.0]), max(known, default=0.0) - min(known, default=0.0)
+        worst = min if figure.more_is_better else max
+        marks.append(
+            {
+                "name": name,
+                "mark": figure.mark,
+                "more_is_better": figure.more_is_better,
+                "mean": round(mean, 5) if known else None,
+                "worst": worst(known) if known else None,
+                "passes": bool(known) and figure._replace(value=worst(known)).passes(),
+                "range": round(spread, 5),
+                "tolerance": round(max(SPREAD * spread, SHARE * abs(mean), LEAST * abs(figure.mark or 0.0)), 5),
+                "digits": figure.digits,
+                "values": values,
+            }
+        )
+    return marks
+
+
+def commit() -> str:
+    """The commit of the repository in the current folder, with -dirty if files were changed; "" without git."""
+    try:
+        asked = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        return subprocess.run(asked, capture_output=True, text=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+
+
+def machine() -> str:
+    """System, processor and the cores that this process may use."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{platform.system()}, {(models or [platform.machine()])[0]}, {usable_cores()} cores"
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:  # on the path but not installed
+        return ""
+
+
+# ---- comparing --------------------------------------------------------------------------------------------------------
+
+
+def read_result(file: Path) -> dict[str, Any]:
+    """A result that ``--json`` wrote. Raises UserError for another file, or half of one."""
+    advice = "name a file that legged-mw exam POLICY --json FILE wrote"
+    try:
+        result = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"--against {shown(file)}: {error.strerror}; {advice}") from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"--against {shown(file)}: it is cut short, or no JSON ({error}); {advice}") from None
+    try:
+        names = [each["name"] for each in result["marks"]]
+        numbers = [each[key] for each in result["marks"] for key in ("mean", "tolerance", "digits")]
+        good = bool(names) and all(isinstance(number, int | float | None) for number in numbers)
+        good = good and isinstance(result["robot"], dict) and isinstance(result["exam"], dict)
+    except (LookupError, TypeError):
+        good = False
+    if not good:
+        raise UserError(f"--against {shown(file)}: no result of this program; {advice}")
+    return result
+
+
+def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
+    """A line for each mark that is worse than ``before`` by more than its tolerance."""
+    now, lines = {each["name"]: each for each in result["marks"]}, []
+    for was in before["marks"]:
+        new, digits = now.get(was["name"], {"mean": None}), was["digits"]
+        if was["mean"] is None:
+            continue
+        if new["mean"] is None:
+            lines.append(f"{was['name']}: not measured, was {was['mean']:.{digits}f}")
+            continue
+        tolerance = max(was["tolerance"], new["range"])
+        worse = was["mean"] - new["mean"] if was["more_is_better"] else new["mean"] - was["mean"]
+        if worse > tolerance:
+            more = f"tolerance {tolerance:.{max(digits, 3)}f}, mark {was['mark']:g}"
+            lines.append(f"{was['name']}: {new['mean']:.{digits}f}, was {was['mean']:.{digits}f} ({more})")
+    return lines
+
+
+def table(result: Mapping[str, Any], before: Mapping[str, Any] | None) -> str:
+    """The marks as text, beside those of ``before``."""
+    heads = ["mean", "worst", "mark", "passes", *(["was", "tolerance"] if before else ["tolerance"])]
+    old = {each["name"]: each for each in before["marks"]} if before else {}
+    lines = [
+        f"{result['exam']['kind']} exam, {result['engine']}, {len(next(iter(result['verdicts'].values())))} repeats"
+    ]
+    lines.append(f"{'':<44}{''.join(f'{head:>11}' for head in heads)}")
+    for each in result["marks"]:
+        was, digits = old.get(each["name"], {}), each["digits"]
+        numbers = [each["mean"], each["worst"], each["mark"]]
+        cells = [_cell(number, digits) for number in numbers] + ["yes" if each["passes"] else "no"]
+        cells += [_cell(was.get("mean"), digits)] if before else []
+        cells += [_cell((was if before else each).get("tolerance"), max(digits, 3))]
+        lines.append(f"{each['name']:<44}{''.join(f'{cell:>11}' for cell in cells)}")
+    return "\n".join(lines)
+
+
+def _cell(number: float | None, digits: int) -> str:
+    return "-" if number is None else f"{number:.{digits}f}"
+
+
+# ---- the badge --------------------------------------------------------------------------------------------------------
+
+
+GOOD, BAD, PLAIN = "#2e7d32", "#c62828", "#444"
+LETTER, PAD, HEIGHT = 7.0, 8.0, 20  # [px]
+
+
+def badge(result: Mapping[str, Any]) -> str:
+    """An SVG: the task, and the last verdict that holds in all repeats."""
+    held = [word for word, repeats in result["verdicts"].items() if all(repeats)]
+    word = (
+        held[-1] if held else {"walks": "does not walk"}.get(first := next(iter(result["verdicts"])), f"not: {first}")
+    )
+    left, right = (LETTER * len(text) + 2 * PAD for text in (result["task"], word))
+    texts = [(PAD, result["task"]), (left + PAD, word)]
+    drawn = "".join(
+        f'<text x="{x:g}" y="14" textLength="{LETTER * len(text):g}" fill="#fff">{escape(text)}</text>'
+        for x, text in texts
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{left + right:g}" height="{HEIGHT}" font-family="sans-serif" font-size="12">'
+        f'<rect width="{left + right:g}" height="{HEIGHT}" rx="3" fill="{PLAIN}"/>'
+        f'<rect x="{left:g}" width="{right:g}" height="{HEIGHT}" rx="3" fill="{GOOD if held else BAD}"/>{drawn}</svg>\n'
+    )
