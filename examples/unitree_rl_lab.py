@@ -93,7 +93,7 @@ def row(name: str, term: dict[str, Any]) -> ContractRow:
 def commands_of(ranges: dict[str, Any]) -> tuple[Command, ...]:
     units = ("m/s", "m/s", "rad/s")
     return tuple(
-        Command(ours, *map(float, ranges[theirs]), unit)
+        Command(ours, float(ranges[theirs][0]), float(ranges[theirs][1]), unit)
         for ours, theirs, unit in zip(VELOCITY, RANGES, units, strict=True)
     )
 
@@ -121,4 +121,6 @@ def scene_of(file: Path, contract: Any) -> str:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        raise SystemExit(__doc__)
     main(*map(Path, sys.argv[1:]))

@@ -91,7 +91,7 @@ ONLY_IN = {
     ],
     "legged_mw.export": ["legged_mw/export/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py"],
-    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/export/network.py"],
+    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/unitree/deploy_yaml.py", "legged_mw/export/network.py"],
     "cyclonedds": ["legged_mw/unitree/idl.py", "legged_mw/unitree/link.py"],
     "configs": ["configs/*", "examples/*"],
     "train": [],
