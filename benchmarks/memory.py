@@ -34,40 +34,11 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw import ROOT
+from legged_mw.tools.doctor import GIB, Peak
 from legged_mw.utils.cli import make_parser, one_line_errors, pick_device, seed_everything
 from legged_mw.utils.errors import out_of_memory
 
-GIB = 2**30
 ITERATIONS = 4  # by then everything is recorded
-
-
-class Peak:
-    """The most of a GPU's memory that was in use while this ran, read from the driver [byte]."""
-
-    def __init__(self, device: str) -> None:
-        self.device, self.most = device, 0
-
-    def read(self) -> int:
-        free, total = torch.cuda.mem_get_info(self.device)
-        self.most = max(self.most, total - free)
-        return total - free
-
-    @contextlib.contextmanager
-    def watched(self) -> Iterator[None]:
-        done = threading.Event()
-
-        def watch() -> None:
-            while not done.wait(0.005):
-                self.read()
-
-        thread = threading.Thread(target=watch, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
-            self.read()
 
 
 def train(task_name: str, worlds: int, device: str, iterations: int) -> None:

@@ -15,7 +15,7 @@ from legged_mw.eval import rollout
 from legged_mw.rl import iteration_log
 from legged_mw.rl.iteration_log import LOG_FILE, Console
 
-NUMBERS = {"reward": 1.234, "episode_length": math.nan, "fell": 2.0, "episodes": 7.0}
+NUMBERS = {"reward": 1.234, "episode_length": math.nan, "fell": 2.0, "episodes": 7.0, "falls_a_minute": 0.8}
 
 
 class Terminal(io.StringIO):
@@ -58,7 +58,7 @@ def test_a_pipe_gets_a_line_an_iteration(
             clock[0] += 2.0
             console.iteration(done, 100, 50 if done < 50 else None, NUMBERS, {}, 1234.5)
     first, *_, last = capsys.readouterr().out.splitlines()
-    said = "reward 1.23, length -, episodes 7, falls 2, 1,234 steps/s"
+    said = "reward 1.23, 0.80 falls a minute, length -, 1,234 steps/s"
     assert first == f"Learning iteration 1/100: {said}, 1:39:00 left, exam in 0:49:00"
     assert last == f"Learning iteration 61/100: {said}, 0:01:18 left"  # at the pace of the last ones, 2 s each
     blocks = (tmp_path / LOG_FILE).read_text()
@@ -68,9 +68,9 @@ def test_a_pipe_gets_a_line_an_iteration(
 
 def test_the_line_of_a_walk_says_what_grows(capsys: pytest.CaptureFixture[str]) -> None:
     """Its reward is clipped at 0 until it walks."""
-    Console().iteration(1, 2, None, {**NUMBERS, "walked": 0.344}, {}, 1.0)
+    Console().iteration(1, 2, None, {**NUMBERS, "walked": 0.344, "terrain_level": 3.14}, {}, 1.0)
     line = capsys.readouterr().out
-    assert "walks 34% of the command, length -, episodes 7, falls 2" in line and "reward" not in line
+    assert "walks 34% of the command, 0.80 falls a minute, level 3.1, length -" in line and "reward" not in line
 
 
 def test_the_time_that_is_left_ends_with_the_deadline(capsys: pytest.CaptureFixture[str], clock: list[float]) -> None:
@@ -78,11 +78,10 @@ def test_the_time_that_is_left_ends_with_the_deadline(capsys: pytest.CaptureFixt
     console.deadline = clock[0] + 45.0
     for done in (1, 2):
         clock[0] += 10.0
-        console.iteration(done, 3 if done == 2 else 1000, None, NUMBERS, {}, 1.0)
+        console.iteration(done, 3 if done == 2 else 1000, 3 if done == 2 else 20, NUMBERS, {}, 1.0)
     first, second = capsys.readouterr().out.splitlines()
-    assert first.endswith(" 0:00:35 left") and second.endswith(" 0:00:10 left"), (
-        "at the latest then, or when the iterations are done"
-    )
+    assert first.endswith(" 0:00:35 left, exam in 0:00:35"), "at the latest then: an exam is no later than the end"
+    assert second.endswith(" 0:00:10 left, exam in 0:00:10"), "or when the iterations are done"
 
 
 def test_verbose_prints_the_block(capsys: pytest.CaptureFixture[str]) -> None:

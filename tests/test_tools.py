@@ -171,6 +171,37 @@ def test_doctor_says_what_is_there_and_what_mends(
     assert speed.startswith("    go1_flat ") and "iterations in " in speed and "worlds, ready after" in speed
 
 
+def cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.strip().strip("|").split("|")]
+
+
+def test_doctor_prints_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line on stdout, with a cell for each column of docs/your_gpu.md."""
+    monkeypatch.setattr(doctor, "load_task", small_task)
+    program("doctor", "--benchmark", "--device", "cpu", "--seconds", "0.1", monkeypatch=monkeypatch)
+    [row] = capsys.readouterr().out.splitlines()
+    heads = [line for line in (ROOT / "docs/your_gpu.md").read_text().splitlines() if line.startswith("| machine")]
+    found = dict(zip(cells(heads[0]), cells(row), strict=True))
+    assert found["worlds"] == str(4 * usable_cores()) and f"torch {torch.__version__}" in found["versions"]
+    assert min(float(found[name].replace(",", "")) for name in ("`env.step`", "training", "memory")) > 0
+
+
+@pytest.mark.parametrize(("fits", "said"), [(True, ["8192", "4.0", "0.37; 27,716"]), (False, ["1024", "1.4", "-"])])
+def test_what_fits_a_gpu_follows_from_two_numbers_of_worlds(
+    fits: bool, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measure(name: str, device: str, seconds: float, worlds: int) -> doctor.Speed:
+        if not worlds and not fits:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return doctor.Speed(worlds or 8192, 1.0, 2e6, 1e6, 10, 5.0, 1.375 if worlds else 4.0)
+
+    monkeypatch.setattr(doctor, "measure", measure)
+    monkeypatch.setattr(doctor, "_processor", lambda device: ("H100", "580"))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, int(11.15 * 2**30)))
+    row = cells(doctor.benchmark("cuda:0", 60.0))
+    assert [row[4], row[7], row[8]] == said
+
+
 def test_doctor_fails_where_nothing_can_train(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

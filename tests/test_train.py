@@ -579,7 +579,7 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
 
 def test_before_an_episode_has_ended_its_means_are_dashes() -> None:
     """They are not known, which is not the same as not finite: a loss that is not finite is shown."""
-    numbers = dict.fromkeys(("learning_rate", "action_std", "episodes", "fell", "broken"), 0.0)
+    numbers = dict.fromkeys(("learning_rate", "action_std", "episodes", "fell", "broken", "falls_a_minute"), 0.0)
     unknown = dict.fromkeys(("reward", "episode_length", "rew_pose", "terrain_level"), math.nan)
     means = ("Mean reward", "Mean episode length", "rew_pose", "Terrain level")
     rows = console_rows({**numbers, **unknown}, {"value": math.nan}, 9.0, 1.0, 1.0)
@@ -597,7 +597,7 @@ def test_what_a_task_counts_is_shown_and_drawn() -> None:
 
     env = make_env(2, {"perturbation.kick": True, "perturbation.curriculum": True}, env_class=Counts)
     env.perturbation.kick_level.copy_(torch.tensor([0.25, 0.5]))
-    numbers = {**env.read_statistics(), "learning_rate": 1e-3, "action_std": 0.5}
+    numbers = {**env.read_statistics(), "learning_rate": 1e-3, "action_std": 0.5, "falls_a_minute": 0.0}
     rows, drawn = console_rows(numbers, {}, 9.0, 1.0, 1.0), curves(numbers, {}, 9.0, 1.0, 1.0, 1)
     assert (rows["My figure"], rows["Kick level"]) == ("7.00", "0.38")
     assert {name: value for name, value in drawn.items() if name.startswith("Curriculum/")} == {

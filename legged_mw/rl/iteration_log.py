@@ -101,6 +101,7 @@ class Report(NamedTuple):
 _KNOWN = (
     *("reward", "episode_length", "episodes", "fell", "broken", "overflowed", "learning_rate", "action_std"),
     "walked",  # share of the commanded speed, where a task commands one and a world is told to walk
+    "falls_a_minute",  # of a robot's own time
 )
 _APART = ("rew_", "broken_by")  # prefixes of numbers that have lines of their own
 
@@ -122,6 +123,7 @@ def console_rows(
         "Mean reward": mean("reward", 2),
         "Mean episode length": mean("episode_length", 1),
         **({"Share of the command walked": mean("walked", 2)} if "walked" in numbers else {}),
+        "Falls a minute of a robot": mean("falls_a_minute", 2),
         **{name: mean(name, 4) for name in numbers if name.startswith("rew_")},
         **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in _of_the_task(numbers)},
         "Episodes ended": f"{numbers['episodes']:.0f} ({ends})",
@@ -142,6 +144,7 @@ def curves(
         "Train/mean_reward": numbers["reward"],
         "Train/mean_episode_length": numbers["episode_length"],
         **({"Train/walked": numbers["walked"]} if "walked" in numbers else {}),
+        "Train/falls_a_minute": numbers["falls_a_minute"],
         **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
         "Episode/fell": numbers["fell"],
         "Episode/broken": numbers["broken"],
@@ -241,13 +244,13 @@ class Console:
         (first, then), (last, now) = self._times[0], self._times[-1]
         return iterations * (now - then) / max(last - first, 1)
 
-    def _left(self, done: int, last: int) -> float:
-        """Time until the end of the training [s]."""
-        seconds = self._seconds(last - done)
+    def _left(self, done: int, iteration: int) -> float:
+        """Time until the end of ``iteration`` [s]; a training's end, and its exam, come at the deadline at the latest."""
+        seconds = self._seconds(iteration - done)
         return min(seconds, max(0.0, self.deadline - time.time())) if self.deadline else seconds
 
     def _until(self, separator: str, done: int, exam: int | None) -> str:
-        return "" if exam is None or exam <= done else f"{separator}exam in {_clock(self._seconds(exam - done))}"
+        return "" if exam is None or exam <= done else f"{separator}exam in {_clock(self._left(done, exam))}"
 
     def __enter__(self) -> Console:
         """Begin to train. Lines that are printed from here on push the bar down."""
@@ -307,12 +310,14 @@ class _Above:
 
 
 def _summary(numbers: Mapping[str, float]) -> str:
-    """What grows as a robot learns. A walk's reward is left out: its sum is clipped at 0, so that it long says nothing."""
-    first = f"reward {_number(numbers['reward'], 2)}"
+    """What shows that a robot learns. A walk's reward is left out: its sum is clipped at 0, so that it long says nothing."""
+    parts = [f"reward {_number(numbers['reward'], 2)}"]
     if "walked" in numbers:
-        first = f"walks {100.0 * numbers['walked']:.0f}% of the command"
-    length = _number(numbers["episode_length"], 1)
-    return f"{first}, length {length}, episodes {numbers['episodes']:.0f}, falls {numbers['fell']:.0f}"
+        parts = [f"walks {100.0 * numbers['walked']:.0f}% of the command"]
+    parts += [f"{numbers['falls_a_minute']:.2f} falls a minute"]
+    if "terrain_level" in numbers:
+        parts += [f"level {_number(numbers['terrain_level'], 1)}"]
+    return ", ".join([*parts, f"length {_number(numbers['episode_length'], 1)}"])
 
 
 def _clock(seconds: float) -> str:

@@ -300,6 +300,7 @@ class Runner(OnPolicyRunner):
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
         [numbers["learning_rate"]], [numbers["action_std"]] = read.learning_rate, read.action_std
+        numbers["falls_a_minute"] = 60.0 * numbers["fell"] / (report.steps * self.env.dt)
         collect, learn = report.seconds()
         speed = report.steps / (collect + learn)
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}

@@ -1,4 +1,7 @@
-"""legged-mw doctor: what this machine has, what it lacks and the command that mends it, and how fast it trains."""
+"""legged-mw doctor: what this machine has, what it lacks and the command that mends it, and how fast it trains.
+
+With --benchmark one line instead, a row of the table in docs/your_gpu.md, to paste into an issue.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,12 @@ import platform
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from packaging.requirements import Requirement
 
@@ -23,7 +27,12 @@ from legged_mw.utils.cli import Parser, pick_device, seed_everything
 from legged_mw.utils.machine import gl_fault, has_display, usable_cores
 from legged_mw.utils.task import load_task, task_names
 
+if TYPE_CHECKING:
+    from legged_mw.envs.robot_task import RobotTask
+
 SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")
+FEW = 1024  # worlds on a GPU, besides the default: two numbers give the memory of one world
+GIB = 2**30
 # used if legged_mw is on the path but not installed
 _LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict")
 _CUDA_WHEELS = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu130"
@@ -39,21 +48,75 @@ class Finding(NamedTuple):
     needed: bool = False  # required for training
 
 
-def parse() -> tuple[str | None, float]:
-    """Parse the flags: the device, and the duration of the speed test [s]."""
+class Peak:
+    """The most of a GPU's memory that was in use while this ran, by all processes, as the driver says [byte]."""
+
+    def __init__(self, device: str) -> None:
+        self.device, self.most = device, 0
+
+    def read(self) -> int:
+        import torch
+
+        free, total = torch.cuda.mem_get_info(self.device)
+        self.most = max(self.most, total - free)
+        return total - free
+
+    @contextlib.contextmanager
+    def watched(self) -> Iterator[None]:
+        done = threading.Event()
+
+        def watch() -> None:
+            while not done.wait(0.005):
+                self.read()
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+            self.read()
+
+
+class Speed(NamedTuple):
+    """What was measured of a task."""
+
+    worlds: int
+    ready: float  # [s] until everything was recorded
+    step: float  # steps of all worlds a second, by env.step alone
+    training: float  # the same, with the policy and the update
+    iterations: int  # of a whole training
+    minutes: float  # of a whole training
+    memory: float  # [GiB] the most in use: on a GPU by all processes, on a CPU by this one
+
+
+def parse() -> tuple[str | None, float, bool]:
+    """Parse the flags: the device, the duration of the speed test [s], and whether one line is asked for."""
     parser = Parser(prog="legged-mw doctor", description=__doc__, allow_abbrev=False)
     parser.add_argument(
         "--device", metavar="D", help="what to measure on: cuda:0, cpu (default: the GPU if there is one)"
     )
     parser.add_argument(
-        "--seconds", type=float, default=30.0, metavar="S", help="how long to train for the speed; 0 leaves it out"
+        "--seconds",
+        type=float,
+        metavar="S",
+        help="how long to train for the speed (default: 30, with --benchmark 60); 0 leaves it out",
     )
+    parser.add_argument("--benchmark", action="store_true", help="measure go1_flat and print one line to paste")
     args = parser.parse_args()
-    return args.device, args.seconds
+    seconds = (60.0 if args.benchmark else 30.0) if args.seconds is None else args.seconds
+    return args.device, seconds, args.benchmark
 
 
 def main() -> None:
-    asked, seconds = parse()
+    asked, seconds, one_line = parse()
+    if one_line:
+        print(
+            f"go1_flat trains for about {seconds:g} s; paste the next line into an issue", file=sys.stderr, flush=True
+        )
+        print(benchmark(pick_device(asked), seconds))
+        return
     missing: list[Finding] = []
     sections: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
         ("This machine", machine),
@@ -221,31 +284,123 @@ def _records(device: str) -> str:
 
 def speed(name: str, device: str, seconds: float) -> str:
     """Train a task for ``seconds``. Return its speed and the estimated time of the whole training, as text."""
+    found = measure(name, device, seconds)
+    whole = f"all {found.iterations} iterations in {found.minutes:.0f} min"
+    return f"{found.training:>10,.0f} steps/s, {whole} ({found.worlds} worlds, ready after {found.ready:.0f} s)"
+
+
+def measure(name: str, device: str, seconds: float, worlds: int = 0) -> Speed:
+    """Train a task, then step it without a policy, ``seconds`` in all. ``worlds``: 0 for the task's own number."""
     import torch
 
     from legged_mw.rl.learner_config import fit_cpu
     from legged_mw.rl.runner import make_runner
 
     task, threads = load_task(name), torch.get_num_threads()
+    task.cfg.env.num_envs = worlds or task.cfg.env.num_envs
     if device == "cpu":
         fit_cpu(task, usable_cores())
         torch.set_num_threads(1)  # as train.py does
     seed_everything(1)
-    begun, quiet = time.perf_counter(), io.StringIO()
-    with contextlib.redirect_stdout(quiet):
+    begun, peak = time.perf_counter(), Peak(device)
+    with contextlib.redirect_stdout(io.StringIO()), peak.watched() if device != "cpu" else contextlib.nullcontext():
         env = task.env_class(task.cfg, device)
         runner = make_runner(env, task.train, None, device)
         runner.learn(5 if device != "cpu" else 1)  # warm-up: recording, choice of the number of threads
-        start, done = time.perf_counter(), 0
-        while done == 0 or time.perf_counter() < begun + seconds:
+    start, done = time.perf_counter(), 0
+    with contextlib.redirect_stdout(io.StringIO()):
+        while done == 0 or time.perf_counter() < begun + 0.8 * seconds:
             runner.learn(4 if device != "cpu" else 1, init_at_random_ep_len=False)
             done += 4 if device != "cpu" else 1
-        took = time.perf_counter() - start
+    took = time.perf_counter() - start
+    step = env.num_envs / _seconds_of_a_step(env, device, 0.2 * seconds)
     torch.set_num_threads(threads)
-    steps = env.num_envs * task.train.runner.num_steps_per_env
-    minutes = task.train.runner.max_iterations * took / done / 60
-    worlds = f"{env.num_envs} worlds, ready after {start - begun:.0f} s"
-    return f"{steps * done / took:>10,.0f} steps/s, all {task.train.runner.max_iterations} iterations in {minutes:.0f} min ({worlds})"
+    steps, iterations = env.num_envs * task.train.runner.num_steps_per_env, task.train.runner.max_iterations
+    memory = _memory() if device == "cpu" else peak.most / GIB
+    return Speed(
+        env.num_envs, start - begun, step, steps * done / took, iterations, iterations * took / done / 60, memory
+    )
+
+
+def _seconds_of_a_step(env: RobotTask, device: str, seconds: float) -> float:
+    """Duration of env.step with random actions, the mean over ``seconds``."""
+    import torch
+
+    actions, calls, start = 0.3 * torch.randn(env.num_envs, env.num_actions, device=device), 0, time.perf_counter()
+    with torch.inference_mode():  # as in training
+        while calls == 0 or time.perf_counter() < start + seconds:
+            for _ in range(20):
+                env.step(actions)
+            if device != "cpu":
+                torch.cuda.synchronize(device)
+            calls += 20
+    return (time.perf_counter() - start) / calls
+
+
+def _memory() -> float:
+    """The most memory that this process held [GiB]; 0 where the system does not say."""
+    if not sys.platform.startswith("linux"):
+        return 0.0
+    import resource
+
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / GIB
+
+
+def benchmark(device: str, seconds: float) -> str:
+    """``go1_flat`` on this machine, as a row of the table in docs/your_gpu.md."""
+    import torch
+
+    from legged_mw.utils.errors import out_of_memory
+
+    what, driver = _processor(device)
+    counts = [FEW, 0] if device != "cpu" else [0]
+    found: list[Speed] = []
+    for worlds in counts:
+        try:
+            found.append(measure("go1_flat", device, seconds / len(counts), worlds))
+        except Exception as error:
+            if not found or not out_of_memory(error):
+                raise
+    last, most = found[-1], "-"  # GiB for 1000 worlds more; how many worlds fit by that
+    if len(found) > 1:
+        of_one = (last.memory - found[0].memory) / (last.worlds - found[0].worlds)
+        free = torch.cuda.mem_get_info(device)[1] / GIB - last.memory
+        most = f"{of_one * 1000:.2f}; {last.worlds + free / of_one:,.0f}" if of_one > 0 else "-"
+    names = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
+    versions = ", ".join(f"{name} {_version(name) or '-'}" for name in ("legged_mw", *names))
+    cells = (
+        what,
+        driver,
+        f"{platform.system()}, Python {platform.python_version()}, {versions}",
+        f"{time.strftime('%Y-%m-%d')}",
+        f"{last.worlds}",
+        f"{last.step:,.0f}",
+        f"{last.training:,.0f}",
+        f"{last.memory:.1f}",
+        most,
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def _processor(device: str) -> tuple[str, str]:
+    """What ``device`` is, how much of it others use, and its driver."""
+    if device == "cpu":
+        lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+        models = [line.partition(": ")[2] for line in lines if line.startswith("model name")]
+        load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+        return f"{(models or [platform.machine()])[0]}, {usable_cores()} cores{load}", "-"
+    import torch
+
+    from legged_mw.sim.device import device_facts
+
+    facts = device_facts(device)
+    of_cuda = f"CUDA {'.'.join(map(str, facts.cuda or ()))}"
+    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
+    version = ""
+    if shutil.which(command[0]):
+        version = subprocess.run(command, capture_output=True, text=True).stdout.partition("\n")[0].strip()
+    taken = f"{facts.memory:.0f} GiB, {facts.taken:.1f} taken before"
+    return f"{torch.cuda.get_device_name(device)}, {taken}", f"{version} {of_cuda}".strip()
 
 
 def _version(package: str) -> str:
