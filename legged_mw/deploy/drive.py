@@ -17,7 +17,7 @@ import numpy as np
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import Gamepad, InputSource, Keys, RobotRemote, StopFile
-from legged_mw.deploy.joint_check import JointCheck
+from legged_mw.deploy.joint_check import LIFT, JointCheck
 from legged_mw.deploy.log import Log, log_path
 from legged_mw.deploy.mirror import FLAGS, LIVE, RobotMonitor
 from legged_mw.deploy.odometry import Odometry
@@ -35,7 +35,6 @@ from legged_mw.view.launch import FlagError
 CHECK_KEYS = "keys: s start, x damping, Esc emergency stop"
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
 GAMEPADS = Path("/dev/input")  # where Linux has them
-LIFT = 0.3  # [m] ours: hangs the robot so high that its feet cannot touch the ground
 STATUS = 0.2  # [s] between two status lines
 
 
