@@ -134,9 +134,6 @@ class Robot(ABC):
         """For the next period: no torque at all. By default it calls ``damp``."""
         self.damp()
 
-    def lower(self) -> None:
-        """Take a simulated robot from its hoist to the ground. At a real one a person does that."""
-
     def health(self) -> Health:
         """The robot's present health; nothing by default."""
         return Health()
