@@ -94,7 +94,7 @@ def test_a_right_robot_does_the_whole_list(exam: Found) -> None:
     [
         ({"swapped": (FL_HIP, FR_HIP)}, JOINTS, "FL_hip_joint: WRONG JOINT: FR_hip_joint moved in its place"),
         ({"swapped": (FL_HIP, FR_HIP), "encoders": True}, STANDING, "torque of F"),
-        ({"gains": {FL_THIGH: 0.5}}, STANDING, "torque short of what is asked of FL_thigh_joint"),
+        ({"gains": {FL_THIGH: 0.5}}, STANDING, "torque, less than asked of FL_thigh_joint"),
         ({"load": 4.0}, STANDING, "weight on the legs"),
     ],
 )
