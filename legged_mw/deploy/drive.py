@@ -16,8 +16,9 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.controller import Controller
+from legged_mw.deploy.first_walk import FirstWalk, rehearse
 from legged_mw.deploy.inputs import Gamepad, InputSource, Keys, RobotRemote, StopFile
-from legged_mw.deploy.joint_check import JointCheck
+from legged_mw.deploy.joint_check import LIFT, JointCheck
 from legged_mw.deploy.log import Log, log_path
 from legged_mw.deploy.mirror import FLAGS, LIVE, RobotMonitor
 from legged_mw.deploy.odometry import Odometry
@@ -35,7 +36,6 @@ from legged_mw.view.launch import FlagError
 CHECK_KEYS = "keys: s start, x damping, Esc emergency stop"
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
 GAMEPADS = Path("/dev/input")  # where Linux has them
-LIFT = 0.3  # [m] ours: hangs the robot so high that its feet cannot touch the ground
 STATUS = 0.2  # [s] between two status lines
 
 
@@ -48,6 +48,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     checked = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
     parser.add_argument("--check_joints", action="store_true", help=checked)
+    first = "a robot's first walk: joint check, stand, stop, ten steps, a metre, each value beside the exam's robot"
+    parser.add_argument("--first_walk", action="store_true", help=first)
     hangs = "a simulated robot hangs until the policy starts (default: if it has two feet), high: its feet in the air, as in --check_joints"
     parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hangs)
     limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
@@ -68,11 +70,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def check_flags(args: argparse.Namespace) -> None:
     """Refuse flags that do not go together. Raises FlagError or LimitError."""
-    if args.check_joints and (
-        others := [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]
-    ):
+    others = [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]
+    if args.check_joints and others:
         raise FlagError(f"--check_joints moves one joint of a robot at a time: leave --{others[0]} out")
-    args.drive |= args.check_joints
+    if args.first_walk and (others := others + ["check_joints"] * args.check_joints):
+        raise FlagError(f"--first_walk is a list with commands and a joint check of its own: leave --{others[0]} out")
+    args.drive |= args.check_joints or args.first_walk
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
     shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
     watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
@@ -93,12 +96,13 @@ def check_flags(args: argparse.Namespace) -> None:
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     """True if a simulated robot begins on a hoist."""
-    return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or args.check_joints))
+    checked = args.check_joints or args.first_walk
+    return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or checked))
 
 
 def lift(args: argparse.Namespace) -> float:
     """Height [m] of the hoisted robot above its start."""
-    return LIFT * (args.hoist == "high" or (args.hoist is None and args.check_joints))
+    return LIFT * (args.hoist == "high" or (args.hoist is None and (args.check_joints or args.first_walk)))
 
 
 def drive(
@@ -110,8 +114,9 @@ def drive(
     kind: str,
     contact: str | None = None,
 ) -> None:
-    """Drive ``robot`` until Ctrl-C or for ``args.time``, or check its joints. A failed joint check exits with code 1.
+    """Drive ``robot`` until Ctrl-C or for ``args.time``, check its joints, or take it for its first walk.
 
+    A joint check or a first walk in which something is wrong exits with code 1.
     ``fixed`` (C,) is the command while no source drives; None: the defaults. ``kind``: of robot, for the log.
     ``contact``: of Odometry, if any.
     """
@@ -123,8 +128,12 @@ def drive(
         console = stack.enter_context(DriveConsole(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
-        checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
-        states = checked or States(controller, sources, command, console.say)
+        if args.first_walk:
+            states = FirstWalk(controller, sources, console.say, robot, safety.limits, rehearse(folder, contract))
+        elif args.check_joints:
+            states = JointCheck(controller, sources, console.say, robot, safety.limits)
+        else:
+            states = States(controller, sources, command, console.say)
         stack.callback(states.close)
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None

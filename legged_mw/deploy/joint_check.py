@@ -22,6 +22,7 @@ from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHECK, DAMPING, SOFT, ZERO, Order, States
 
 STEP = 0.1  # [rad] motion of a joint
+LIFT = 0.3  # [m] ours: hangs a simulated robot so high that its feet cannot touch the ground
 SETTLE, RAMP, REST = 2.0, 0.8, 0.6  # [s] ours: until all joints are held; ramp between two poses; rest after each joint
 SOFTLY, HOLD = 0.4, 1.2  # [s] ours, at the step: before the joint gets stiffer; before the verdict
 # [share of the stiffness per second] until the joint moves enough; SOFT may not overcome friction and weight

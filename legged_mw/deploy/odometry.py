@@ -61,7 +61,7 @@ class Odometry:
         self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]
         self._imu = int(self.model.site(contract.imu).id)
         self._feet = [_Foot(self.model, names) for names in contract.feet.values()]
-        self._gravity = float(np.linalg.norm(self.model.opt.gravity))
+        self.gravity = float(np.linalg.norm(self.model.opt.gravity))
         self.velocity: Floats = np.zeros((count, 3))  # (N, 3) [m/s] body frame
         self._variance: Floats = np.zeros(count)  # (N,) [m^2/s^2] its variance, equal in all axes
         self._shock: Floats = np.full((count, 3), np.nan)  # (N, 3) [m/s^2] last accelerometer value
@@ -78,7 +78,7 @@ class Odometry:
         )
         felt_before = np.where(np.isfinite(self._shock), self._shock, felt)
         self._shock = felt.copy()
-        pull = 0.5 * (felt + felt_before) + self._gravity * gravity
+        pull = 0.5 * (felt + felt_before) + self.gravity * gravity
         velocity = self.velocity + self.contract.period * (pull - np.cross(gyro, self.velocity))
         variance = self._variance + (self.contract.period * DRIFT) ** 2
         legs = self.legs(measured)
@@ -97,7 +97,7 @@ class Odometry:
         if self.contact == "measured":
             return np.atleast_2d(measured.foot_contact) > 0.0
         if self.contact == "torque":
-            return legs.force > LOADED * self.contract.mass * self._gravity
+            return legs.force > LOADED * self.contract.mass * self.gravity
         depth = (legs.place * np.atleast_2d(measured.gravity)[:, None]).sum(axis=2)
         return depth > depth.max(axis=1, keepdims=True) - LEVEL
 
@@ -112,7 +112,7 @@ class Odometry:
         NaN unless three feet or more carry the robot. It reads nothing of the IMU.
         """
         legs = self.legs(replace(measured, gravity=np.array([0.0, 0.0, -1.0]), ang_vel=np.zeros(3)))
-        weight = self.contract.mass * self._gravity
+        weight = self.contract.mass * self.gravity
         place = legs.place[0, legs.force[0] > LOADED * weight]
         if len(place) < 3 or legs.force.sum() < CARRIES * weight:
             return np.full(3, np.nan)

@@ -332,6 +332,7 @@ class MujocoRobot(Robot):
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
         self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"
         self._start[2] += lift
+        self._lift = lift
 
     def read(self) -> Measurement:
         return self.fleet.read().of(0)
@@ -349,6 +350,14 @@ class MujocoRobot(Robot):
 
     def limp(self) -> None:
         self._move(self._targets, 0.0 * self._gains[0], 0.0 * self._gains[1])
+
+    def lower(self) -> None:
+        """Put it on the ground if it hangs above; one with two feet goes on hanging there."""
+        if self.hoisted:
+            self._start[2], self._lift = self._start[2] - self._lift, 0.0
+            self.fleet.qpos[0, :7], self.fleet.qvel[0, :6] = self._start, 0.0
+            self.fleet.refresh()
+            self.hoisted = len(self.fleet.contract.feet) == 2
 
     def close(self) -> None:
         """Damp the joints from now on, even after a later ``write``."""

@@ -37,6 +37,7 @@ go1_getup --scene nosuch.xml --eval
 go1_flat --command=0,0,0 --commands a.yaml
 go1_flat --eval --out folder
 go1_flat --check_joints --command=0,0,0
+go1_flat --first_walk --check_joints
 go1_flat --drive --eval
 go1_flat --drive --num_envs 2
 go1_flat --log a

@@ -1,0 +1,450 @@
+"""The first walk: the list that a robot goes through before it is let go, each value beside that of the exam's robot.
+
+Hanging, joint check, stand, emergency stop, ten steps on the spot, a metre ahead. The exam's robot, which is simulated
+from the export, does the same list first; what is measured of it is expected. Where a value differs by more than is
+allowed, the joints are damped and the list ends. A person presses a button before each step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.controller import Controller
+from legged_mw.deploy.inputs import END, START, WALK, DriveInput, InputSource
+from legged_mw.deploy.joint_check import LIFT, JointCheck, Moves
+from legged_mw.deploy.odometry import Odometry
+from legged_mw.deploy.robot import Floats, Health, Measurement, Robot
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import Limits, Safety, Trip
+from legged_mw.deploy.simulated import MujocoRobot
+from legged_mw.deploy.states import CHECK, DAMPING, POLICY, RISE, STAND, ZERO, Order
+from legged_mw.utils.commands import VELOCITY
+from legged_mw.utils.errors import UserError
+
+HANGING, JOINTS, STANDING, STOPPING, SPOT, METRE = STEPS = (
+    "hanging",
+    "joint check",
+    "stand",
+    "emergency stop",
+    "on the spot",
+    "a metre",
+)
+STOP = "the emergency stop"  # what a person presses, beside START and WALK
+CALM, LOOK = 2.0, 1.0  # [s] ours: to come to rest; over which a value is taken
+TURN, AHEAD = 0.5, 0.5  # [rad/s], [m/s] ours: commands, or the most that was trained
+COUNT = 10  # steps of each foot, on average
+PATIENCE, LONGEST = 2.0, 15.0  # ours: a walk is given up after so many of the exam's times; the exam's own after [s]
+# Allowed differences, ours: a right simulated robot that has a delay of 10 ms, noise and 0.9 of its gains stays within
+# them (docs/first_walk.md)
+TILT, BEYOND, MOVED, LEFT = 15.0, 0.25, 0.05, 1.5  # [deg], [rad], [rad], [N m] of a robot that is damped
+ASIDE, HEADING, YAW, TIME = 0.25, 20.0, 0.1, 0.3  # [m], [deg], [rad/s], [s]
+CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; of its yaw rate, times and torques
+STANDS, WALKS = 0.1, 0.07  # [share of the motor's torque] of a torque in the stand, while the policy is on
+SHORT = 1.0  # [N m], or SHARE of the torque, that a motor may give less than it is asked for
+
+
+class Value(NamedTuple):
+    """A value of one step; of a value by joint that of the joint which differs most."""
+
+    step: str
+    name: str
+    unit: str
+    measured: float
+    exam: float
+    allowed: float
+
+    @property
+    def right(self) -> bool:
+        return abs(self.measured - self.exam) <= self.allowed
+
+    def __str__(self) -> str:
+        verdict = "right" if self.right else f"DIFFERS by {self.measured - self.exam:+.2f}, {self.allowed:.2f} allowed"
+        return f"{self.step:<15}{self.name:<58}{self.measured:8.2f}{self.exam:8.2f} {self.unit:<4} {verdict}"
+
+
+HEADS = f"{'':<73}{'robot':>8}{'exam':>8}"
+
+
+class Differs(Exception):
+    """A value differs from the exam's, in words."""
+
+
+@dataclass
+class _Walked:
+    """What was measured since a command began, one entry a period."""
+
+    torque: list[Floats]  # (D,) [N m]
+    asked: list[Floats]  # (D,) [N m] by the servos' stiffness
+    tilt: list[float]  # [rad]
+    turn: list[float]  # [rad/s] about the body's z axis
+    velocity: list[Floats]  # (2,) [m/s] by leg odometry, body frame
+    stands: list[Any]  # (F,) feet on the ground
+
+    @property
+    def steps(self) -> float:
+        """Touchdowns of a foot, on average."""
+        down = np.array(self.stands)
+        return float((down[1:] & ~down[:-1]).sum() / down.shape[1])
+
+    def path(self, period: float) -> Floats:
+        """(2,) [m] ahead and to the left of where it began."""
+        heading, (x, y) = np.cumsum(self.turn) * period, np.array(self.velocity).T
+        cos, sin = np.cos(heading), np.sin(heading)
+        return period * np.array([(cos * x - sin * y).sum(), (sin * x + cos * y).sum()])
+
+
+class FirstWalk(JointCheck):
+    """The list of one robot. ``values`` has each value, ``found`` those by joint."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        sources: Sequence[InputSource],
+        say: Callable[[str], None],
+        robot: Robot,
+        limits: Limits,
+        exam: Mapping[tuple[str, str], Floats] | None = None,
+    ) -> None:
+        """``exam``: ``found`` of the exam's robot, from ``rehearse``; None: this is the exam's robot.
+
+        Raises UserError if the policy follows no velocity, RobotError as JointCheck does, ContractError without feet.
+        """
+        super().__init__(controller, sources, say, robot, limits)
+        contract = controller.contract
+        if not {*VELOCITY} <= {each.name for each in contract.commands}:
+            raise UserError(f"--first_walk is of a policy that follows {', '.join(VELOCITY)}; {contract.task} does not")
+        self._robot, self._exam, self._odometry = robot, exam, Odometry(controller.folder, contract, 1, "torque")
+        self.values, self.found = list[Value](), dict[tuple[str, str], Floats]()
+        self.at, self.wants, self.ended = HANGING, "", ""  # step; what a person presses next; why the list ended
+        self._asked, self._now, self._steps = self._velocity(), 0.0, self._all()
+        self._walked, self._judged = _Walked([], [], [], [], [], []), 0
+        next(self._steps)
+
+    @property
+    def over(self) -> bool:
+        return bool(self.ended)
+
+    @property
+    def right(self) -> bool:
+        """True if the whole list was done and no value differs."""
+        return self.at == METRE and not self.wants and all(value.right for value in self.values)
+
+    def listen(self, health: Health, now: float) -> Trip | None:
+        stop = super().listen(health, now)
+        self.command = self._asked  # the sticks do not drive
+        return stop
+
+    def step(self, measured: Measurement, now: float) -> Order:
+        self._now = now
+        try:
+            if END in self._pressed:
+                raise Differs(f"{END} was pressed")
+            if self.at not in (HANGING, JOINTS):
+                self._move_on(measured, now)
+            return self._steps.send(measured)
+        except StopIteration:
+            self.ended = "the first walk is done"
+        except Differs as why:
+            self.ended = str(why)
+        self._enter(DAMPING, now, self.ended)
+        return Order(DAMPING)
+
+    def trip(self, trip: Trip, now: float) -> Order:
+        if trip.limit != "stop" or self.wants != STOP:
+            self.ended = trip.text
+        return super().trip(trip, now)
+
+    def _begin(self, measured: Measurement, now: float) -> None:
+        if self.wants != WALK:
+            self._tell(f"{WALK} has to wait: {self.at} comes first")
+            return
+        super()._begin(measured, now)
+        if self.state != POLICY:
+            raise Differs(f"{self.at}: {self.note}")
+
+    # ---- the steps: generators that are sent measurements and yield orders
+
+    def _all(self) -> Moves:
+        measured = yield Order(ZERO)
+        measured = yield from self._hangs(measured)
+        measured = yield from self._joints(measured)
+        measured = yield from self._get_up(measured, "lower it until its feet carry it, the rope slack")
+        measured = yield from self._stands(measured)
+        measured = yield from self._stops(measured)
+        measured = yield from self._get_up(measured, "once more")
+        measured = yield from self._on_the_spot(measured)
+        yield from self._a_metre(measured)
+
+    def _hangs(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """It hangs at zero torque, nearly level, and no angle is one that its joint cannot have."""
+        while self._now < CALM:
+            measured = yield Order(ZERO)
+        self._want(START, f"{START}: joint check, if it hangs with its feet in the air")
+        while START not in self._pressed:
+            measured = yield Order(ZERO)
+        angles = measured.joint_pos
+        beyond = np.maximum(0.0, np.maximum(angles - self._limits.high, self._limits.low - angles))
+        self._compare("tilt", "deg", math.degrees(_tilt(measured)), TILT)
+        self._compare("beyond its range", "rad", beyond, BEYOND)
+        self._judge()
+        return measured
+
+    def _joints(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """The joint check; its own verdicts end the list too."""
+        self.at = JOINTS
+        self._want("", f"each joint moves a little; {END} if another one moves than the one that is named", CHECK)
+        yield from self._check(measured)
+        self._say(super().report)
+        if wrong := [f"{self.joints[row.joint]}: {row.verdict}" for row in self.rows if row.verdict != "right"]:
+            raise Differs(f"{self.at}: {'; '.join(wrong)}")
+        if len(self.rows) < len(self.joints):
+            raise Differs(f"{self.at}: {self.note}")
+        self._compare("moved", "rad", np.array([abs(row.moved[row.joint]) for row in self.rows]), MOVED)
+        self._judge()
+        self.first, self.at = STAND, STANDING
+        return (yield Order(DAMPING))
+
+    def _get_up(self, measured: Measurement, how: str) -> Generator[Order, Measurement, Measurement]:
+        """From damping over zero torque to standing, at rest."""
+        self._want(START, f"{how}; then {START}: zero torque", DAMPING)
+        while self.state == DAMPING:
+            measured = yield Order(DAMPING)
+        if isinstance(self._robot, MujocoRobot):
+            self._robot.lower()  # a real one is lowered by a person
+        self.wants = ""
+        while self.state == ZERO:
+            if self._now - self.since > CALM and not self.wants:
+                self._want(START, f"{START}: stand")
+            measured = yield Order(ZERO)
+        self.wants = ""
+        while self._now - self.since < RISE + CALM:
+            measured = yield self._stand(measured, self._now)
+        return measured
+
+    def _stands(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """What the legs carry by their torques, and each motor's torque."""
+        carried, torques, asked = [], [], []
+        for _ in range(self._periods(LOOK)):
+            order = self._stand(measured, self._now)
+            assert order.targets is not None and order.stiffness is not None
+            carried.append(self._odometry.legs(measured).force.sum() / self._odometry.gravity)
+            torques.append(measured.joint_torque.copy())
+            asked.append(order.stiffness * (order.targets - measured.joint_pos))
+            measured = yield order
+        if len(self.controller.contract.feet) > 2:  # a biped stands on its rope until the policy starts
+            self._compare("weight on the legs", "kg", np.mean(carried), 0.0, CARRIED)
+            self._compare_torque("torque", torques, asked, STANDS)
+        self._judge()
+        return measured
+
+    def _stops(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """The emergency stop, by the one who will hold it, leaves no torque."""
+        self.at = STOPPING
+        self._want(STOP, f"now press {STOP}")
+        while self.state == STAND:
+            measured = yield self._stand(measured, self._now)
+        self.wants, stopped = "", self._now
+        while self._now - stopped < CALM:
+            measured = yield Order(self.state)
+        self._compare("torque left after 2 s", "N m", measured.joint_torque, LEFT)
+        self._judge()
+        self.at = SPOT
+        return measured
+
+    def _on_the_spot(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """The policy stands, then turns slowly until it has done ten steps."""
+        self._want(WALK, f"{WALK}: policy, ten steps on the spot")
+        while self.state == STAND:
+            measured = yield self._stand(measured, self._now)
+        self.wants = ""
+        self._odometry.reset()
+        measured = yield from self._walk(measured, self._velocity(), lambda: self._lasted >= CALM + LOOK)
+        last = slice(-self._periods(LOOK), None)
+        self._compare_torque("torque at rest", self._walked.torque[last], self._walked.asked[last], WALKS)
+        self._compare("largest tilt at rest", "deg", math.degrees(max(self._walked.tilt)), TILT)
+        self._judge()
+        done = "time of ten steps"
+        measured = yield from self._walk(
+            measured, self._velocity(ang_vel_yaw=TURN), lambda: self._walked.steps >= COUNT, done
+        )
+        self._compare("yaw rate", "rad/s", np.mean(self._walked.turn), YAW, SHARE)
+        self._compare_walk(done)
+        return (yield from self._rest(measured))
+
+    def _a_metre(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """A metre ahead, by leg odometry."""
+        self.at = METRE
+        self._want(WALK, f"{WALK}: a metre ahead, with the rope slack")
+        while WALK not in self._pressed:
+            measured = yield from self._rest(measured)
+        self.wants, done = "", "time of a metre"
+        period = self.controller.contract.period
+        measured = yield from self._walk(
+            measured, self._velocity(lin_vel_x=AHEAD), lambda: self._walked.path(period)[0] >= 1.0, done
+        )
+        self._compare("to the left", "m", self._walked.path(period)[1], ASIDE)
+        self._compare("turned", "deg", math.degrees(sum(self._walked.turn) * period), HEADING)
+        self._compare_walk(done)
+        return measured
+
+    # ---- their parts
+
+    @property
+    def _lasted(self) -> float:
+        """[s] since the command began."""
+        return len(self._walked.tilt) * self.controller.contract.period
+
+    def _periods(self, seconds: float) -> int:
+        return round(seconds / self.controller.contract.period)
+
+    def _velocity(self, **wanted: float) -> Floats:
+        """Command (C,): the defaults and ``wanted``, within what was trained."""
+        contract = self.controller.contract
+        return contract.held(
+            [wanted.get(each.name, 0.0 if each.name in VELOCITY else each.default) for each in contract.commands]
+        )
+
+    def _walk(
+        self, measured: Measurement, command: Floats, done: Callable[[], bool], timed: str = ""
+    ) -> Generator[Order, Measurement, Measurement]:
+        """Let the policy follow ``command`` until it is ``done``. ``timed``: the value that its duration is."""
+        self._asked, self._walked = command, _Walked([], [], [], [], [], [])
+        exam = None if self._exam is None or not timed else self._exam[self.at, timed]
+        longest = LONGEST if exam is None else PATIENCE * float(exam[0])
+        while not (self._walked.tilt and done()):
+            if self._lasted > longest:
+                raise Differs(f"{self.at}: {timed}: not done after {longest:.1f} s")
+            measured = yield from self._act(measured)
+        return measured
+
+    def _rest(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """A period of the policy with the command to stand."""
+        self._asked = self._velocity()
+        return (yield from self._act(measured))
+
+    def _act(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
+        """A period of the policy."""
+        walked, estimate = self._walked, self._odometry(measured)
+        walked.torque.append(measured.joint_torque.copy())
+        walked.tilt.append(_tilt(measured))
+        walked.turn.append(float(measured.ang_vel[2]))
+        walked.velocity.append(estimate.lin_vel[:2].copy())
+        walked.stands.append(self._odometry.stands(measured, self._odometry.legs(measured))[0])
+        self.controller.act(measured, self._asked)
+        targets = self.controller.last_targets[0].copy()
+        held = np.clip(targets, self._limits.lowest, self._limits.highest)
+        walked.asked.append(self.controller.contract.stiffness * (held - measured.joint_pos))
+        return (yield Order(POLICY, targets))
+
+    def _want(self, button: str, note: str, state: str = "") -> None:
+        """Say what a person presses next; enter ``state`` if there is one."""
+        self.wants = button
+        if state and state != self.state:
+            self._enter(state, self._now, note)
+        else:
+            self._tell(note)
+
+    # ---- what is measured, beside the exam's
+
+    def _compare_walk(self, timed: str) -> None:
+        self._compare(timed, "s", self._lasted, TIME, SHARE)
+        self._compare(
+            "torque, rms",
+            "N m",
+            np.sqrt(np.mean(np.square(self._walked.torque), axis=0)),
+            WALKS * self._motor_torque,
+            SHARE,
+        )
+        self._compare("largest tilt", "deg", math.degrees(max(self._walked.tilt)), TILT)
+        self._judge()
+
+    @property
+    def _motor_torque(self) -> Floats:
+        """(D,) [N m] largest torque of the motors; 20 where none is known."""
+        return np.where(np.isfinite(self._limits.motor), self._limits.motor, 20.0)
+
+    def _compare_torque(self, name: str, torques: Sequence[Floats], asked: Sequence[Floats], share: float) -> None:
+        """Compare mean torques (N, D), also with what the servos were asked for: a weak motor gives less.
+
+        One that reports what it should give shows by its torque, or by the weight that all of them seem to carry.
+        """
+        torque = np.mean(torques, axis=0)
+        short = np.abs(np.mean(asked, axis=0) - torque)
+        self._compare(f"{name}, less than asked", "N m", short, np.maximum(SHORT, SHARE * np.abs(torque)))
+        self._compare(name, "N m", torque, share * self._motor_torque, SHARE)
+
+    def _compare(self, name: str, unit: str, measured: Any, least: float | Floats, share: float = 0.0) -> None:
+        """Keep a value, or one by joint (D,). Allowed is the ``least`` difference, or a ``share`` of the exam's value."""
+        measured = np.atleast_1d(measured)
+        self.found[self.at, name] = measured
+        exam = measured if self._exam is None else self._exam[self.at, name]
+        allowed = np.maximum(least, share * np.abs(exam))
+        worst = int(np.argmax(np.abs(measured - exam) / np.maximum(allowed, 1e-9)))
+        who = f" of {self.joints[worst]}" if len(measured) > 1 else ""
+        self.values.append(
+            Value(self.at, name + who, unit, *(float(each[worst]) for each in (measured, exam, allowed)))
+        )
+
+    def _judge(self) -> None:
+        """Say the values since the last verdict. Raises Differs if one is not right."""
+        new, self._judged = self.values[self._judged :], len(self.values)
+        if new:
+            self._say("\n".join([HEADS, *map(str, new)]))
+        if wrong := [value for value in new if not value.right]:
+            raise Differs(" ".join(str(wrong[0]).split()))
+
+    @property
+    def report(self) -> str:
+        """The end of the list in a line; begins with a newline."""
+        if self.right:
+            return f"\nfirst walk: all {len(STEPS)} steps done, {len(self.values)} values as the exam's"
+        return f"\nfirst walk: it ended at '{self.at}': {self.ended or self.note}"
+
+
+def _tilt(measured: Measurement) -> float:
+    """[rad] between gravity and the body's z axis."""
+    return math.acos(float(np.clip(-measured.gravity[2], -1.0, 1.0)))
+
+
+# ---- the exam's robot
+
+
+class _Willing:
+    """Presses what the list wants."""
+
+    def __init__(self) -> None:
+        self.walk: FirstWalk | None = None
+
+    def poll(self, health: Health) -> DriveInput:
+        wants = self.walk.wants if self.walk else ""
+        return DriveInput(frozenset({wants} - {"", STOP}), stop="the exam's" if wants == STOP else "")
+
+    def let_go(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def first_walk(
+    robot: Robot, folder: Path, contract: Contract, exam: Mapping[tuple[str, str], Floats] | None = None
+) -> FirstWalk:
+    """The list, done at once by a simulated ``robot`` that hangs, every button pressed when it is wanted."""
+    controller, willing = Controller(folder, contract), _Willing()
+    limits = Limits.of(folder, contract, robot.limits)
+    walk = willing.walk = FirstWalk(controller, [willing], lambda _: None, robot, limits, exam)
+    run(robot, controller, lambda _: np.zeros(0), live=False, safety=Safety(contract, limits), states=walk)
+    return walk
+
+
+def rehearse(folder: Path, contract: Contract) -> Mapping[tuple[str, str], Floats]:
+    """The values of the exam's robot. Raises UserError if it does not get through the list."""
+    walk = first_walk(MujocoRobot(folder, contract, whole=True, hoisted=True, lift=LIFT), folder, contract)
+    if not walk.right:
+        raise UserError(f"the exam's robot itself does not do it:{walk.report.replace(chr(10), ' ')}; see --eval first")
+    return walk.found
