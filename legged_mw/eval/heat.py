@@ -1,0 +1,359 @@
+"""Will it trip? The motors' heat, their limits and the battery's power, from torques and speeds. Numpy alone.
+
+``legged_mw.deploy.heat_exam`` records an export. Shapes: T physics steps, N robots, D motors. A motor is what turns a
+joint: its torque and speed are the joint's. A rating that nobody published is NaN, and what needs it is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[Any]
+
+HOT = 85.0  # [deg C] of a winding [as the limit in deploy/safety.py: drives switch themselves off at 90]
+AMBIENTS = (20.0, 40.0)  # [deg C] of the room, and of the winding at the start
+AT_LIMIT = 0.98  # share of the torque-speed limit: a larger torque counts as at the limit [as in eval/skills.py]
+LOADED = 6  # rows of the text table: the motors that are loaded most
+
+# Tables a joint of the config's section ``ratings`` -> unit; ``battery_power`` is the robot's
+TABLES = {
+    "continuous_torque": "N m",
+    "motor_constant": "N m/W^0.5",
+    "thermal_resistance": "K/W",
+    "thermal_time": "s",
+    "peak_torque": "N m",
+    "knee_speed": "rad/s",
+    "top_speed": "rad/s",
+}
+THERMAL = ("motor_constant", "thermal_resistance", "thermal_time")
+
+
+class Ratings(NamedTuple):
+    """What the motors and the battery bear: (D,) each at the joint, NaN where unknown."""
+
+    continuous_torque: Floats  # [N m] RMS, for ever
+    motor_constant: Floats  # [N m/W^0.5] torque per root of the heat in the winding: Kt * gear / sqrt(resistance)
+    thermal_resistance: Floats  # [K/W] from the winding to the room
+    thermal_time: Floats  # [s] time constant of the winding
+    peak_torque: Floats  # [N m] up to knee_speed; unknown: the simulation's limit
+    knee_speed: Floats  # [rad/s] from here on the torque falls; unknown: only at top_speed
+    top_speed: Floats  # [rad/s] without load
+    battery_power: float  # [W] the most that the battery gives
+
+    @classmethod
+    def of(cls, tables: Mapping[str, Sequence[float | None]], battery_power: float | None, count: int) -> Ratings:
+        """Ratings from lists of ``count`` numbers, None where unknown; a table that is left out is unknown."""
+        full = {name: np.array(tables.get(name, [None] * count), dtype=float) for name in TABLES}
+        return cls(**full, battery_power=math.nan if battery_power is None else battery_power)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is known: name -> one number for all motors, or a list with None where unknown."""
+        found: dict[str, Any] = {}
+        for name in TABLES:
+            values = _plain(getattr(self, name))
+            if any(value is not None for value in values):
+                found[name] = values[0] if len(set(values)) == 1 else values
+        return found | ({} if math.isnan(self.battery_power) else {"battery_power": self.battery_power})
+
+    def unknown(self) -> list[str]:
+        """Names of the ratings, among those that say whether it trips, that some motor or the battery lacks."""
+        heat = (name for name in ("continuous_torque", *THERMAL) if np.isnan(getattr(self, name)).any())
+        return [*heat, *(["battery_power"] if math.isnan(self.battery_power) else [])]
+
+
+# ---- the model ------------------------------------------------------------------------------------------------------
+
+
+def rms(torque: Floats) -> Floats:
+    """(D,) [N m] root of the mean square of ``torque`` (T, N, D)."""
+    return np.sqrt((torque**2).mean(axis=(0, 1), dtype=float))
+
+
+def settled(torque: Floats, ratings: Ratings, ambient: float) -> Floats:
+    """(D,) [deg C] that windings reach in the end at the RMS ``torque`` (D,) in a room of ``ambient`` [deg C]."""
+    return ambient + (torque / ratings.motor_constant) ** 2 * ratings.thermal_resistance
+
+
+def seconds_until_hot(torque: Floats, ratings: Ratings, ambient: float) -> Floats:
+    """(D,) [s] until a winding that begins at ``ambient`` has HOT; infinite if it never does, NaN if unknown.
+
+    First order: thermal_time * dT/dt = settled - T. Its strides must be short beside ``thermal_time``, as they are.
+    """
+    rise, room = settled(torque, ratings, ambient) - ambient, HOT - ambient
+    share = room / np.maximum(rise, 1e-9)
+    time = -ratings.thermal_time * np.log1p(-np.minimum(share, 1.0 - 1e-12))
+    return np.where(np.isnan(rise) | np.isnan(time), np.nan, np.where(share < 1.0, time, np.inf))
+
+
+def highest_torque(speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
+    """(T, N, D) [N m] that a motor can push with at ``speed`` along its motion: flat to the knee, then a line to 0.
+
+    ``limit`` (D,): the simulation's torque limits, where no peak torque is known.
+    """
+    peak = np.where(np.isnan(ratings.peak_torque), limit, ratings.peak_torque)
+    top = np.where(np.isnan(ratings.top_speed), np.inf, ratings.top_speed)
+    knee = np.minimum(np.where(np.isnan(ratings.knee_speed), top, ratings.knee_speed), top)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left = np.where(np.abs(speed) <= knee, 1.0, (top - np.abs(speed)) / (top - knee))
+    return peak * np.clip(np.nan_to_num(left, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+
+
+def at_limit(torque: Floats, speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
+    """(D,) Share of time at the torque-speed limit or beyond; NaN for a motor without any limit.
+
+    A motor that brakes has ``limit`` (D,) at any speed.
+    """
+    most = np.where(torque * speed > 0.0, highest_torque(speed, ratings, limit), limit)
+    share = (np.abs(torque) >= AT_LIMIT * most).mean(axis=(0, 1))
+    known = np.isfinite(limit) | ~np.isnan(ratings.peak_torque)
+    return np.where(known, share, np.nan)
+
+
+def power(torque: Floats, speed: Floats, ratings: Ratings) -> Floats:
+    """(T, N) [W] from the battery: motion and the windings' heat, where a motor constant is known.
+
+    Motors that brake feed the others; what is left over does not count as given back.
+    """
+    heat = np.nan_to_num((torque / ratings.motor_constant) ** 2)
+    return np.maximum((torque * speed + heat).sum(axis=2), 0.0)
+
+
+# ---- figures of an export -------------------------------------------------------------------------------------------
+
+
+class Motion(NamedTuple):
+    """N robots that stand, walk or do what they are for, sampled at each physics step."""
+
+    torque: Floats  # (T, N, D) [N m]
+    speed: Floats  # (T, N, D) [rad/s]
+
+
+class Switch(NamedTuple):
+    """From a stand in the default pose, held by the policy's gains, to the policy."""
+
+    step: float  # [s] of the physics
+    jump: Floats  # (D,) [rad] from the pose to the policy's first target, before any clamp
+    before: Floats  # (D,) [N m] the last torque of the stand
+    after: Motion  # of one robot, from the policy's first target on
+    period: float  # [s] between two targets
+
+
+def phase(motion: Motion, ratings: Ratings, limit: Floats) -> dict[str, Any]:
+    """A motion's figures, lists (D,) in the order of the motors; None where unknown."""
+    load, taken = rms(motion.torque), power(*motion, ratings)
+    minutes = {f"{each:g}": seconds_until_hot(load, ratings, each) / 60.0 for each in AMBIENTS}
+    return {
+        "rms": _plain(load),
+        "of_limit": _plain(load / limit),
+        "of_rating": _plain(load / ratings.continuous_torque),
+        "at_limit": _plain(at_limit(*motion, ratings, limit)),
+        "settles": {f"{each:g}": _plain(settled(load, ratings, each)) for each in AMBIENTS},  # [deg C]
+        "minutes": {each: _plain(values) for each, values in minutes.items()},  # None where it never gets so hot, too
+        "mean_power": round(float(taken.mean()), 1),
+        "peak_power": round(float(taken.max()), 1),
+    }
+
+
+def switched(switch: Switch, ratings: Ratings, joints: Sequence[str]) -> dict[str, Any]:
+    """The jumps of target and torque within the first period, and the peak power with its duration at half of it."""
+    first = switch.after.torque[: max(1, round(switch.period / switch.step)), 0]
+    change = np.abs(first - switch.before).max(axis=0)
+    taken = power(*switch.after, ratings)[:, 0]
+    peak = float(taken.max())
+    return {
+        "target_jump": round(float(np.abs(switch.jump).max()), 4),
+        "target_joint": joints[int(np.abs(switch.jump).argmax())],
+        "torque_jump": round(float(change.max()), 3),
+        "torque_joint": joints[int(change.argmax())],
+        "peak_power": round(peak, 1),
+        "seconds": round(float((taken >= 0.5 * peak).sum()) * switch.step, 4) if peak > 0.0 else 0.0,
+    }
+
+
+def finish(
+    joints: Sequence[str],
+    ratings: Ratings,
+    limit: Floats,
+    motions: Mapping[str, Motion | None],
+    switch: Switch | None,
+) -> dict[str, Any]:
+    """The result, for JSON. ``motions``: "standing", "walking" and so on; None: it fell. ``limit``: (D,) [N m]."""
+    result: dict[str, Any] = {
+        "joints": list(joints),
+        "ratings": ratings.to_dict(),
+        "unknown": ratings.unknown(),
+        "phases": {name: phase(each, ratings, limit) if each else None for name, each in motions.items()},
+        "switch": switched(switch, ratings, joints) if switch else None,
+    }
+    return {**result, "reasons": (found := reasons(result)), "trips": True if found else _verdict(result)}
+
+
+def reasons(result: Mapping[str, Any]) -> list[str]:
+    """Why it may trip, in words; empty if nothing that is known says so."""
+    found, most = [], result["ratings"].get("battery_power")
+    for name, each in result["phases"].items():
+        if not each:
+            continue
+        cool = f"{AMBIENTS[0]:g}"
+        if (hot := _least(each["minutes"][cool])) is not None:
+            later = [each["minutes"][f"{room:g}"][hot] for room in AMBIENTS[1:]]
+            others = ", ".join(f"{m:.0f} min at {room:g} C" for m, room in zip(later, AMBIENTS[1:], strict=True))
+            time = f"{each['minutes'][cool][hot]:.0f} min {name} at {cool} C"
+            found.append(f"{_short(result, hot)} reaches {HOT:g} C after {time}, {others}")
+        over = _most(each["of_rating"])
+        if over is not None and each["of_rating"][over] > 1.0:
+            share = f"{each['rms'][over]:.1f} N m RMS {name}, {each['of_rating'][over]:.2f} of its continuous rating"
+            found.append(f"{_short(result, over)} carries {share}: it overheats")
+        if most is not None and each["peak_power"] > most:
+            found.append(f"{_watts(each['peak_power'])} {name}, and the battery gives {_watts(most)}: it may cut power")
+    at = result["switch"]
+    if at and most is not None and at["peak_power"] > most:
+        burst = f"{_watts(at['peak_power'])} for {1000 * at['seconds']:.0f} ms at the switch"
+        found.append(f"{burst}, and the battery gives {_watts(most)}: this robot may cut power")
+    return found
+
+
+def _verdict(result: Mapping[str, Any]) -> bool | None:
+    """False if all that could trip is known, else None. The winding's figures or the continuous torque are enough."""
+    lacking = set(result["unknown"])
+    heat = "continuous_torque" in lacking and bool(lacking & set(THERMAL))
+    return None if heat or "battery_power" in lacking or None in result["phases"].values() else False
+
+
+# ---- words ----------------------------------------------------------------------------------------------------------
+
+
+def lines(result: Mapping[str, Any]) -> list[str]:
+    """One line each: heat, torque-speed limit, power, switch, verdict."""
+    said, names = [], result["joints"]
+    for name, each in result["phases"].items():
+        if not each:
+            said.append(f"{name}: it fell, so nothing is known")
+            continue
+        said += [f"{name}: {_heat_words(result, each)}", f"{name}: {_limit_words(result, each)}"]
+        said.append(f"{name}: {_power_words(result, each)}")
+    if at := result["switch"]:
+        jump = f"{at['target_jump']:.2f} rad ({_bare(at['target_joint'])})"
+        torque = f"{at['torque_jump']:.1f} N m ({_bare(at['torque_joint'])})"
+        burst = f"{_watts(at['peak_power'])} at most, for {1000 * at['seconds']:.0f} ms above half of that"
+        said.append(f"switch from stand to policy: targets jump by {jump}, torque by {torque}; {burst}")
+    if result["unknown"]:
+        said.append(f"unknown of {len(names)} motors and the battery: {', '.join(result['unknown'])}")
+    return [*said, f"will it trip: {verdict(result)}"]
+
+
+def verdict(result: Mapping[str, Any]) -> str:
+    """Yes with the reasons, no, or unknown."""
+    if result["trips"]:
+        return f"yes: {'; '.join(result['reasons'])}"
+    return "unknown" if result["trips"] is None else "no"
+
+
+def _heat_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
+    """Of the motor that is hot first, else of the one nearest to its rating, else to its torque limit."""
+    cool = f"{AMBIENTS[0]:g}"
+    if (hot := _least(each["minutes"][cool])) is not None:
+        return f"{_short(result, hot)} reaches {HOT:g} C after {each['minutes'][cool][hot]:.0f} min at {cool} C"
+    if (warm := _most(each["settles"][cool])) is not None:
+        return f"the warmest winding, {_short(result, warm)}, settles at {each['settles'][cool][warm]:.0f} C at {cool} C"
+    if (near := _most(each["of_rating"])) is not None:
+        share = f"{each['rms'][near]:.1f} N m RMS, {each['of_rating'][near]:.2f} of its continuous rating"
+        return f"{_short(result, near)} carries {share}; minutes until {HOT:g} C are unknown"
+    near = _most(each["of_limit"])
+    near = int(np.argmax(each["rms"])) if near is None else near
+    share = "" if each["of_limit"][near] is None else f", {each['of_limit'][near]:.2f} of its torque limit"
+    words = f"{_short(result, near)} carries {each['rms'][near]:.1f} N m RMS{share}"
+    return f"{words}; its continuous rating and minutes until {HOT:g} C are unknown"
+
+
+def _limit_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
+    near = _most(each["at_limit"])
+    if near is None:
+        return "the motors' torque-speed limits are unknown"
+    if not each["at_limit"][near]:
+        return "no motor is at its torque-speed limit"
+    return f"{_short(result, near)} is at its torque-speed limit {each['at_limit'][near]:.1%} of the time"
+
+
+def _power_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
+    most, losses = result["ratings"].get("battery_power"), "motor_constant" not in result["unknown"]
+    gives = "what the battery gives is unknown" if most is None else f"the battery gives {_watts(most)}"
+    what = "" if losses else " without the windings' losses, which are unknown"
+    return f"{_watts(each['mean_power'])} mean, {_watts(each['peak_power'])} at most{what}; {gives}"
+
+
+def rows(result: Mapping[str, Any], most: int | None = None) -> list[list[str]]:
+    """A heading, then a row a motor; with ``most`` only the motors that are loaded most."""
+    found = {name: each for name, each in result["phases"].items() if each}
+    rooms = ", ".join(f"{each:g}" for each in AMBIENTS)
+    heads = [""]
+    for name in found:
+        heads += [f"{name}: RMS [N m]", "of limit", "of rating", "time at limit", f"min to {HOT:g} C at {rooms} C"]
+    order = range(len(result["joints"]))
+    if most is not None and found:
+        load = np.max([[share or 0.0 for share in each["of_limit"]] for each in found.values()], axis=0)
+        order = np.argsort(-load, kind="stable")[:most].tolist()
+    table = [heads]
+    for i in order:
+        cells = [_short(result, i)]
+        for each in found.values():
+            shares = [_cell(each[key][i], ".2f") for key in ("of_limit", "of_rating")]
+            times = [_minutes(each, f"{room:g}", i) for room in AMBIENTS]
+            same = times[0] if len(set(times)) == 1 else ", ".join(times)
+            cells += [f"{each['rms'][i]:.1f}", *shares, _cell(each["at_limit"][i], ".1%"), same]
+        table.append(cells)
+    return table
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """The result as text."""
+    found = rows(result, LOADED)
+    widths = [max(map(len, column)) for column in zip(*found, strict=True)]
+    said = [f"heat and power: the {len(found) - 1} most loaded of {len(result['joints'])} motors"]
+    for name, *cells in found:
+        padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
+        said.append("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+    return "\n".join([*said, *lines(result)])
+
+
+def _minutes(each: Mapping[str, Any], room: str, i: int) -> str:
+    if each["minutes"][room][i] is not None:
+        return f"{each['minutes'][room][i]:.0f}"
+    return "unknown" if each["settles"][room][i] is None else "never"
+
+
+def _cell(value: float | None, digits: str) -> str:
+    return "unknown" if value is None else format(value, digits)
+
+
+def _watts(value: float) -> str:
+    return f"{value / 1000.0:.1f} kW" if value >= 1000.0 else f"{value:.0f} W"
+
+
+def _short(result: Mapping[str, Any], i: int) -> str:
+    return _bare(result["joints"][i])
+
+
+def _bare(joint: str) -> str:
+    return joint.removesuffix("_joint")
+
+
+def _most(values: Sequence[float | None]) -> int | None:
+    """Index of the largest value; None if all are unknown."""
+    known = [(value, -i) for i, value in enumerate(values) if value is not None]
+    return -max(known)[1] if known else None
+
+
+def _least(values: Sequence[float | None]) -> int | None:
+    known = [(value, i) for i, value in enumerate(values) if value is not None]
+    return min(known)[1] if known else None
+
+
+def _plain(values: Floats) -> list[float | None]:
+    """Numbers for JSON; None for NaN and infinity."""
+    return [round(float(value), 5) if math.isfinite(value) else None for value in values]
