@@ -13,6 +13,7 @@ from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, C
 from legged_mw.deploy.drive import lift
 from legged_mw.deploy.exam import SwitchStage, contract_skill, run_exam, run_skill
 from legged_mw.deploy.hard_exam import run_hard
+from legged_mw.deploy.heat_exam import run_heat
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
@@ -145,7 +146,7 @@ def parse() -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam, in a third of the time")
+    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam and heat, in a third of the time")
     parser.add_argument(
         "--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name"
     )
@@ -284,7 +285,7 @@ def examine(
 ) -> None:
     """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage.
 
-    ``hard``: the hard exam too, of a policy that walks. ``scene``: ``scene_file`` of DeployStage.
+    ``hard``: heat and power too, and of a policy that walks the hard exam. ``scene``: ``scene_file`` of DeployStage.
     """
     contract = read_contract(folder, edited)
     writable(str(path), "--out")
@@ -296,15 +297,18 @@ def examine(
         if isinstance(scene, Path):
             raise UserError("--scene is of robots that walk, and this exam has grounds of its own: leave it out")
         skill = contract_skill(contract)
-        result = run_skill(folder, skill, edited=edited)
+        result, rules = run_skill(folder, skill, edited=edited), skill
         print(skill.table(result))
     else:
         result = run_exam(folder, common=common, contact=contact, edited=edited, scene=scene)
         print(walking.table(result))
+        rules = walking.ExamRules.from_mapping(result["rules"])
         if hard and contract.feet:
-            rules = walking.ExamRules.from_mapping(result["rules"])
             result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene)
             print(f"\n{table(result['hard'])}")
+    if hard:
+        result["heat"] = run_heat(folder, rules, edited, scene)
+        print(f"\n{heat.table(result['heat'])}")
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"scene": shown(scene)} if isinstance(scene, Path) else {}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}

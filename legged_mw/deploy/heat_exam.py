@@ -45,13 +45,14 @@ def run_heat(
         each=lambda: recorder[0].sample(),
     )
     recorder.append(Recorder(stage.fleet))
+    holds = walks and contract.action.origin not in ("torque", "speed")
     if isinstance(exam, ExamRules):
-        motions, switch = walk(stage, recorder[0], half_speed(exam))
+        motions, switch = walk(stage, recorder[0], half_speed(exam), holds)
     else:
         motions, switch = {exam.kind: perform(stage, recorder[0], exam)}, None
     joints = [stage.fleet.model.joint(name).id for name in contract.joints]
     ratings = contract.ratings or Ratings.of({}, None, len(joints))
-    return heat.finish(contract.joints, ratings, torque_limits(stage.fleet.model, joints), motions, switch)
+    return heat.finish(contract.joints, ratings, torque_limits(stage.fleet.model, joints), motions, switch, holds)
 
 
 class Recorder:
@@ -74,12 +75,12 @@ class Recorder:
         return motion
 
 
-def walk(stage: DeployStage, recorder: Recorder, vx: float) -> tuple[dict[str, Motion | None], Switch | None]:
-    """A robot that is held in its default pose, then stands by its policy, then walks at ``vx`` [m/s]."""
-    contract, switch = stage.contract, None
-    stand, ahead = (commands_of(contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
-    if contract.action.origin not in ("torque", "speed"):
-        switch = switch_over(stage, recorder, contract, stand)
+def walk(
+    stage: DeployStage, recorder: Recorder, vx: float, holds: bool
+) -> tuple[dict[str, Motion | None], Switch | None]:
+    """A robot that its servos hold in the default pose (``holds``), then stands by its policy, then walks at ``vx``."""
+    stand, ahead = (commands_of(stage.contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
+    switch = switch_over(stage, recorder, stage.contract, stand) if holds else None
     motions: dict[str, Motion | None] = {}
     for name, command in (("standing", stand), ("walking", ahead)):
         fell = _run(stage, SETTLING, command)
@@ -89,19 +90,23 @@ def walk(stage: DeployStage, recorder: Recorder, vx: float) -> tuple[dict[str, M
 
 
 def switch_over(stage: DeployStage, recorder: Recorder, contract: Contract, stand: Floats) -> Switch | None:
-    """Hold the default pose for STAND, then start the policy; None if the robot falls."""
+    """Hold the default pose for STAND, then start the policy; None if the robot falls then.
+
+    Meanwhile the root can sink but neither tilt nor slide, as if a person kept it upright: else a biped topples.
+    """
+    fleet, start = stage.fleet, stage.qpos()[0]
     for _ in range(round(STAND / stage.dt)):
-        stage.fleet.write(contract.default_pose[None])
-    stage.measured = stage.fleet.read()
-    if stage.fleet.fell()[0]:
-        stage.reset(0)
-        return None
+        fleet.write(contract.default_pose[None])
+        fleet.qpos[0, [0, 1, 3, 4, 5, 6]] = start[[0, 1, 3, 4, 5, 6]]
+        fleet.qvel[0, [0, 1, 3, 4, 5]] = 0.0
+        fleet.refresh()
+    stage.measured = fleet.read()
     before = recorder.take().torque[-1, 0]
     stage.step(stand)
     jump = stage.controller.last_targets[0] - contract.default_pose
     if _run(stage, AFTER - stage.dt, stand):
         return None
-    return Switch(stage.fleet.model.opt.timestep, jump, before, recorder.take(), contract.period)
+    return Switch(fleet.model.opt.timestep, jump, before, recorder.take(), contract.period)
 
 
 def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:

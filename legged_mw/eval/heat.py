@@ -181,14 +181,19 @@ def finish(
     limit: Floats,
     motions: Mapping[str, Motion | None],
     switch: Switch | None,
+    switches: bool = False,
 ) -> dict[str, Any]:
-    """The result, for JSON. ``motions``: "standing", "walking" and so on; None: it fell. ``limit``: (D,) [N m]."""
+    """The result, for JSON. ``motions``: "standing", "walking" and so on; None: it fell. ``limit``: (D,) [N m].
+
+    ``switches``: whether a switch was tried; the robot fell then if there is no ``switch``.
+    """
     result: dict[str, Any] = {
         "joints": list(joints),
         "ratings": ratings.to_dict(),
         "unknown": ratings.unknown(),
         "phases": {name: phase(each, ratings, limit) if each else None for name, each in motions.items()},
         "switch": switched(switch, ratings, joints) if switch else None,
+        "switches": switches,
     }
     return {**result, "reasons": (found := reasons(result)), "trips": True if found else _verdict(result)}
 
@@ -228,6 +233,10 @@ def _verdict(result: Mapping[str, Any]) -> bool | None:
 # ---- words ----------------------------------------------------------------------------------------------------------
 
 
+_UNKNOWN = "unknown"
+LEAD = f"the {{count}} most loaded of {{motors}} motors, with minutes until a winding has {HOT:g} C where they are known"
+
+
 def lines(result: Mapping[str, Any]) -> list[str]:
     """One line each: heat, torque-speed limit, power, switch, verdict."""
     said, names = [], result["joints"]
@@ -237,6 +246,8 @@ def lines(result: Mapping[str, Any]) -> list[str]:
             continue
         said += [f"{name}: {_heat_words(result, each)}", f"{name}: {_limit_words(result, each)}"]
         said.append(f"{name}: {_power_words(result, each)}")
+    if result["switch"] is None and result["switches"]:
+        said.append("switch from stand to policy: it falls at once")
     if at := result["switch"]:
         jump = f"{at['target_jump']:.2f} rad ({_bare(at['target_joint'])})"
         torque = f"{at['torque_jump']:.1f} N m ({_bare(at['torque_joint'])})"
@@ -251,7 +262,7 @@ def verdict(result: Mapping[str, Any]) -> str:
     """Yes with the reasons, no, or unknown."""
     if result["trips"]:
         return f"yes: {'; '.join(result['reasons'])}"
-    return "unknown" if result["trips"] is None else "no"
+    return _UNKNOWN if result["trips"] is None else "no"
 
 
 def _heat_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
@@ -288,47 +299,41 @@ def _power_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
 
 
 def rows(result: Mapping[str, Any], most: int | None = None) -> list[list[str]]:
-    """A heading, then a row a motor; with ``most`` only the motors that are loaded most."""
+    """A heading, then a row a motor; with ``most`` only the motors that are loaded most. Unknown columns are left out."""
     found = {name: each for name, each in result["phases"].items() if each}
-    rooms = ", ".join(f"{each:g}" for each in AMBIENTS)
-    heads = [""]
-    for name in found:
-        heads += [f"{name}: RMS [N m]", "of limit", "of rating", "time at limit", f"min to {HOT:g} C at {rooms} C"]
     order = range(len(result["joints"]))
     if most is not None and found:
         load = np.max([[share or 0.0 for share in each["of_limit"]] for each in found.values()], axis=0)
         order = np.argsort(-load, kind="stable")[:most].tolist()
-    table = [heads]
-    for i in order:
-        cells = [_short(result, i)]
-        for each in found.values():
-            shares = [_cell(each[key][i], ".2f") for key in ("of_limit", "of_rating")]
-            times = [_minutes(each, f"{room:g}", i) for room in AMBIENTS]
-            same = times[0] if len(set(times)) == 1 else ", ".join(times)
-            cells += [f"{each['rms'][i]:.1f}", *shares, _cell(each["at_limit"][i], ".1%"), same]
-        table.append(cells)
-    return table
+    columns = [["", *(_short(result, i) for i in order)]]
+    for name, each in found.items():
+        columns.append([f"{name}: RMS [N m]", *(f"{each['rms'][i]:.1f}" for i in order)])
+        for key, title, digits in (("of_limit", "of limit", ".2f"), ("of_rating", "of rating", ".2f")):
+            columns.append([title, *(_cell(each[key][i], digits) for i in order)])
+        columns.append(["at limit", *(_cell(each["at_limit"][i], ".1%") for i in order)])
+        columns += [[f"min at {room:g} C", *(_minutes(each, f"{room:g}", i) for i in order)] for room in AMBIENTS]
+    return [list(row) for row in zip(*(each for each in columns if {*each[1:]} != {_UNKNOWN}), strict=True)]
 
 
 def table(result: Mapping[str, Any]) -> str:
     """The result as text."""
     found = rows(result, LOADED)
     widths = [max(map(len, column)) for column in zip(*found, strict=True)]
-    said = [f"heat and power: the {len(found) - 1} most loaded of {len(result['joints'])} motors"]
+    said = [f"heat and power: {LEAD.format(count=len(found) - 1, motors=len(result['joints']))}"]
     for name, *cells in found:
         padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
-        said.append("  ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+        said.append("   ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
     return "\n".join([*said, *lines(result)])
 
 
 def _minutes(each: Mapping[str, Any], room: str, i: int) -> str:
     if each["minutes"][room][i] is not None:
         return f"{each['minutes'][room][i]:.0f}"
-    return "unknown" if each["settles"][room][i] is None else "never"
+    return _UNKNOWN if each["settles"][room][i] is None else "never"
 
 
 def _cell(value: float | None, digits: str) -> str:
-    return "unknown" if value is None else format(value, digits)
+    return _UNKNOWN if value is None else format(value, digits)
 
 
 def _watts(value: float) -> str:
