@@ -33,7 +33,7 @@ def run_heat(
     ``edited``: see read_contract. ``scene``: see Fleet. Raises ContractError, UserError.
     """
     contract, walks = read_contract(folder, edited), isinstance(exam, ExamRules)
-    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on) if walks else Ends()
+    ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on) if walks else None  # as in run_exam
     recorder: list[Recorder] = []
     stage = DeployStage(
         folder,
@@ -118,13 +118,16 @@ def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
     return fell
 
 
-def perform(stage: DeployStage, recorder: Recorder, skill: Skill) -> Motion:
-    """TRIES robots in the first of the exam's starts, on its first ground, the task's own."""
+def perform(stage: DeployStage, recorder: Recorder, skill: Skill) -> Motion | None:
+    """Those of TRIES robots that do not fall, in the first of the exam's starts on its first ground, the task's own."""
     said, follower = stage.contract.motion, stage.controller.follower
     motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
     robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
     if starts := skill.starts(robot, stage.num_worlds):
         stage.put(*starts)
+    stands = np.ones(stage.num_worlds, dtype=bool)
     for _ in range(skill.steps(robot)):
         stage.step()
-    return recorder.take()
+        stands &= ~stage.fell()
+    torque, speed = recorder.take()
+    return Motion(torque[:, stands], speed[:, stands]) if stands.any() else None
