@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from legged_mw.deploy.contract import make_ratings
 from legged_mw.eval import heat
-from legged_mw.eval.heat import Motion, Ratings, Switch
+from legged_mw.eval.heat import Motion, Switch
+from legged_mw.utils import motor_heat
+from legged_mw.utils.motor_heat import Ratings
 
 LIMIT = np.array([20.0, 50.0])
 
@@ -17,7 +20,7 @@ LIMIT = np.array([20.0, 50.0])
 def ratings(**known: Any) -> Ratings:
     """Of two motors; what is not given is unknown."""
     battery = known.pop("battery_power", None)
-    return Ratings.of({name: [value] * 2 for name, value in known.items()}, battery, 2)
+    return make_ratings({name: [value] * 2 for name, value in known.items()}, battery, 2)
 
 
 WINDING = {"motor_constant": 2.0, "thermal_resistance": 4.0, "thermal_time": 300.0}
@@ -26,8 +29,8 @@ WINDING = {"motor_constant": 2.0, "thermal_resistance": 4.0, "thermal_time": 300
 def test_a_constant_torque_heats_by_an_exponential() -> None:
     """10 N m at 2 N m/W^0.5 are 25 W, at 4 K/W 100 K: from 20 C to 85 C the time is -300 s * ln(1 - 65 / 100)."""
     load = np.array([10.0, 8.0])  # 8 N m are 16 W, 64 K: 84 C and no more at 20 C, 104 C at 40 C
-    assert heat.settled(load, ratings(**WINDING), 20.0) == pytest.approx([120.0, 84.0])
-    cool, warm = (heat.seconds_until_hot(load, ratings(**WINDING), room) for room in (20.0, 40.0))
+    assert motor_heat.settled(load, ratings(**WINDING), 20.0) == pytest.approx([120.0, 84.0])
+    cool, warm = (motor_heat.seconds_until_hot(load, ratings(**WINDING), room) for room in (20.0, 40.0))
     assert cool[0] == pytest.approx(-300.0 * math.log(0.35)) and math.isinf(cool[1])
     assert warm == pytest.approx([-300.0 * math.log(0.55), -300.0 * math.log(1.0 - 45.0 / 64.0)])
 
@@ -35,21 +38,23 @@ def test_a_constant_torque_heats_by_an_exponential() -> None:
 def test_the_closed_form_is_the_model_stepped() -> None:
     """A torque that is on for half of each 0.4 s, stepped by Euler, is hot when its RMS says so."""
     known, torque, winding, time = ratings(**WINDING), 14.0, 20.0, 0.0
-    while winding < heat.HOT:
+    while winding < motor_heat.HOT:
         on = torque if time % 0.4 < 0.2 else 0.0
         winding += 0.02 * ((on / 2.0) ** 2 * 4.0 - (winding - 20.0)) / 300.0
         time += 0.02
     load = np.array([torque / math.sqrt(2.0), 0.0])
-    until = heat.seconds_until_hot(load, known, 20.0)
+    until = motor_heat.seconds_until_hot(load, known, 20.0)
     assert time == pytest.approx(until[0], rel=2e-3) and math.isinf(until[1])
 
 
 def test_rms_and_power() -> None:
     torque = np.array([[[3.0, 0.0]], [[-4.0, 2.0]]])  # (T=2, N=1, D=2)
     speed = np.array([[[2.0, 5.0]], [[1.0, 1.0]]])
-    assert heat.rms(torque) == pytest.approx([math.sqrt(12.5), math.sqrt(2.0)])
-    assert heat.power(torque, speed, ratings())[:, 0] == pytest.approx([6.0, 0.0])  # 2 W braking are not given back
-    lossy = heat.power(torque, speed, ratings(motor_constant=2.0))[:, 0]
+    assert motor_heat.rms(torque) == pytest.approx([math.sqrt(12.5), math.sqrt(2.0)])
+    assert motor_heat.power(torque, speed, ratings())[:, 0] == pytest.approx(
+        [6.0, 0.0]
+    )  # 2 W braking are not given back
+    lossy = motor_heat.power(torque, speed, ratings(motor_constant=2.0))[:, 0]
     assert lossy == pytest.approx([6.0 + 9.0 / 4.0, -4.0 + 2.0 + 16.0 / 4.0 + 4.0 / 4.0])
 
 
@@ -57,11 +62,11 @@ def test_the_torque_speed_limit() -> None:
     """Flat at 20 N m to 10 rad/s, then a line to 0 at 30: 10 N m at 20 rad/s. Braking has the whole torque."""
     curve = ratings(peak_torque=20.0, knee_speed=10.0, top_speed=30.0)
     speeds = np.array([5.0, 10.0, 20.0, 30.0, 40.0])[:, None, None] * np.ones((1, 1, 2))
-    assert heat.highest_torque(speeds, curve, LIMIT)[:, 0, 0] == pytest.approx([20.0, 20.0, 10.0, 0.0, 0.0])
+    assert motor_heat.highest_torque(speeds, curve, LIMIT)[:, 0, 0] == pytest.approx([20.0, 20.0, 10.0, 0.0, 0.0])
     torque = np.array([[[9.0, 9.9]], [[-9.9, -9.9]]])
-    assert heat.at_limit(torque, np.full((2, 1, 2), 20.0), curve, LIMIT).tolist() == [0.0, 0.5]
-    assert heat.highest_torque(speeds, ratings(), LIMIT)[-1, 0].tolist() == LIMIT.tolist()  # nothing is known
-    free = heat.at_limit(torque, torque, ratings(), np.full(2, np.inf))
+    assert motor_heat.at_limit(torque, np.full((2, 1, 2), 20.0), curve, LIMIT).tolist() == [0.0, 0.5]
+    assert motor_heat.highest_torque(speeds, ratings(), LIMIT)[-1, 0].tolist() == LIMIT.tolist()  # nothing is known
+    free = motor_heat.at_limit(torque, torque, ratings(), np.full(2, np.inf))
     assert np.isnan(free).all()
 
 

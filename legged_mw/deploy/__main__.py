@@ -18,7 +18,7 @@ from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import walking
+from legged_mw.eval import heat, walking
 from legged_mw.eval.hard import table
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
@@ -146,7 +146,9 @@ def parse() -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam and heat, in a third of the time")
+    parser.add_argument(
+        "--no_hard", action="store_true", help="--eval without the hard exam and heat, in a third of the time"
+    )
     parser.add_argument(
         "--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name"
     )

@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.heat import Ratings
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError, brief, unknown
 from legged_mw.utils.files import digest, finish_moving
+from legged_mw.utils.motor_heat import BATTERY, TABLES, Ratings
 from legged_mw.utils.motor_network import (
     DC_CONSTANT,
     DC_DAMPING,
@@ -160,7 +160,7 @@ class Action(NamedTuple):
         return values | {"scale": short(values["scale"])}
 
 
-def short(values: Sequence[float]) -> float | list[float]:
+def short(values: Sequence[Any]) -> Any:
     """One number if all are equal, else the list."""
     return values[0] if len(set(values)) == 1 else list(values)
 
@@ -354,7 +354,13 @@ class Motors(NamedTuple):
 
 
 SERVOS = Motors()
-RATINGS, BATTERY = "ratings", "battery_power"
+RATINGS = "ratings"
+
+
+def make_ratings(tables: Mapping[str, Sequence[float | None]], battery_power: float | None, joints: int) -> Ratings:
+    """Ratings from lists (D,), None where unknown; a table that is left out is unknown."""
+    full = {name: np.array(tables.get(name, [None] * joints), dtype=float) for name in TABLES}
+    return Ratings(**full, battery_power=math.nan if battery_power is None else battery_power)
 
 
 def read_ratings(section: Reader, joints: int) -> Ratings:
@@ -362,13 +368,21 @@ def read_ratings(section: Reader, joints: int) -> Ratings:
     for name in section.values:
         if name not in Ratings._fields:
             raise ContractError(f"{section.where}: {unknown('rating', name, Ratings._fields, RATINGS)}")
-    tables = {}
-    for name in (name for name in section.values if name != BATTERY):
-        wanted = f"a number above zero, or {joints} of them, one a joint, null where unknown"
-        value = section.take(name, wanted, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints))
-        tables[name] = value if isinstance(value, list) else [value] * joints
-    battery = section.above_zero(BATTERY) if BATTERY in section.values else None
-    return Ratings.of(tables, battery, joints)
+    tables, wanted = {}, f"a number above zero, or {joints} of them, one a joint, null where unknown"
+    for name in TABLES:
+        if name in section.values:
+            value = section.take(name, wanted, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints))
+            tables[name] = value if isinstance(value, list) else [value] * joints
+    return make_ratings(tables, section.above_zero(BATTERY) if BATTERY in section.values else None, joints)
+
+
+def ratings_to_dict(ratings: Ratings) -> dict[str, Any]:
+    """The section ``ratings``: what is known, one number where all motors have the same; empty if nothing is."""
+    known = {name: values for name in TABLES if not np.isnan(values := getattr(ratings, name)).all()}
+    lists = {name: [None if math.isnan(value) else value for value in known[name].tolist()] for name in known}
+    battery = {} if math.isnan(ratings.battery_power) else {BATTERY: ratings.battery_power}
+    said = {name: short(values) for name, values in lists.items()} | battery
+    return {RATINGS: said} if said else {}
 
 
 def _rates(value: object) -> bool:
@@ -631,7 +645,7 @@ class Contract:
             **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
             **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
             **self.motors.to_dict(),
-            **({RATINGS: known} if self.ratings and (known := self.ratings.to_dict()) else {}),
+            **(ratings_to_dict(self.ratings) if self.ratings else {}),
             **({MOTION: self.motion.to_dict()} if self.motion else {}),
         }
         return sealed(said)

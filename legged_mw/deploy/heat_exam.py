@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
+from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, make_ratings, read_contract
 from legged_mw.deploy.hard_exam import commands_of
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Fleet
@@ -15,7 +15,7 @@ from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.user_scene import torque_limits
 from legged_mw.eval import heat
 from legged_mw.eval.hard import half_speed
-from legged_mw.eval.heat import Motion, Ratings, Switch
+from legged_mw.eval.heat import Motion, Switch
 from legged_mw.eval.skills import ExamRobot, ReferenceMotion, Skill
 from legged_mw.eval.walking import ExamRules
 
@@ -51,7 +51,7 @@ def run_heat(
     else:
         motions, switch = {exam.kind: perform(stage, recorder[0], exam)}, None
     joints = [stage.fleet.model.joint(name).id for name in contract.joints]
-    ratings = contract.ratings or Ratings.of({}, None, len(joints))
+    ratings = contract.ratings or make_ratings({}, None, len(joints))
     return heat.finish(contract.joints, ratings, torque_limits(stage.fleet.model, joints), motions, switch, holds)
 
 

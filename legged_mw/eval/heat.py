@@ -1,7 +1,6 @@
-"""Will it trip? The motors' heat, their limits and the battery's power, from torques and speeds. Numpy alone.
+"""Will it trip? Heat, limits and power of an export's motors: figures, verdict and words. Numpy alone.
 
-``legged_mw.deploy.heat_exam`` records an export. Shapes: T physics steps, N robots, D motors. A motor is what turns a
-joint: its torque and speed are the joint's. A rating that nobody published is NaN, and what needs it is unknown.
+``legged_mw.deploy.heat_exam`` records what is judged. Shapes: as in ``legged_mw.utils.motor_heat``, which has the model.
 """
 
 from __future__ import annotations
@@ -11,117 +10,23 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[Any]
+from legged_mw.utils.motor_heat import (
+    BATTERY,
+    HOT,
+    TABLES,
+    Floats,
+    Ratings,
+    at_limit,
+    power,
+    rms,
+    seconds_until_hot,
+    settled,
+)
 
-HOT = 85.0  # [deg C] of a winding [as the limit in deploy/safety.py: drives switch themselves off at 90]
 AMBIENTS = (20.0, 40.0)  # [deg C] of the room, and of the winding at the start
-AT_LIMIT = 0.98  # share of the torque-speed limit: a larger torque counts as at the limit [as in eval/skills.py]
 LOADED = 6  # rows of the text table: the motors that are loaded most
-
-# Tables a joint of the config's section ``ratings`` -> unit; ``battery_power`` is the robot's
-TABLES = {
-    "continuous_torque": "N m",
-    "motor_constant": "N m/W^0.5",
-    "thermal_resistance": "K/W",
-    "thermal_time": "s",
-    "peak_torque": "N m",
-    "knee_speed": "rad/s",
-    "top_speed": "rad/s",
-}
 THERMAL = ("motor_constant", "thermal_resistance", "thermal_time")
-
-
-class Ratings(NamedTuple):
-    """What the motors and the battery bear: (D,) each at the joint, NaN where unknown."""
-
-    continuous_torque: Floats  # [N m] RMS, for ever
-    motor_constant: Floats  # [N m/W^0.5] torque per root of the heat in the winding: Kt * gear / sqrt(resistance)
-    thermal_resistance: Floats  # [K/W] from the winding to the room
-    thermal_time: Floats  # [s] time constant of the winding
-    peak_torque: Floats  # [N m] up to knee_speed; unknown: the simulation's limit
-    knee_speed: Floats  # [rad/s] from here on the torque falls; unknown: only at top_speed
-    top_speed: Floats  # [rad/s] without load
-    battery_power: float  # [W] the most that the battery gives
-
-    @classmethod
-    def of(cls, tables: Mapping[str, Sequence[float | None]], battery_power: float | None, count: int) -> Ratings:
-        """Ratings from lists of ``count`` numbers, None where unknown; a table that is left out is unknown."""
-        full = {name: np.array(tables.get(name, [None] * count), dtype=float) for name in TABLES}
-        return cls(**full, battery_power=math.nan if battery_power is None else battery_power)
-
-    def to_dict(self) -> dict[str, Any]:
-        """What is known: name -> one number for all motors, or a list with None where unknown."""
-        found: dict[str, Any] = {}
-        for name in TABLES:
-            values = _plain(getattr(self, name))
-            if any(value is not None for value in values):
-                found[name] = values[0] if len(set(values)) == 1 else values
-        return found | ({} if math.isnan(self.battery_power) else {"battery_power": self.battery_power})
-
-    def unknown(self) -> list[str]:
-        """Names of the ratings, among those that say whether it trips, that some motor or the battery lacks."""
-        heat = (name for name in ("continuous_torque", *THERMAL) if np.isnan(getattr(self, name)).any())
-        return [*heat, *(["battery_power"] if math.isnan(self.battery_power) else [])]
-
-
-# ---- the model ------------------------------------------------------------------------------------------------------
-
-
-def rms(torque: Floats) -> Floats:
-    """(D,) [N m] root of the mean square of ``torque`` (T, N, D)."""
-    return np.sqrt((torque**2).mean(axis=(0, 1), dtype=float))
-
-
-def settled(torque: Floats, ratings: Ratings, ambient: float) -> Floats:
-    """(D,) [deg C] that windings reach in the end at the RMS ``torque`` (D,) in a room of ``ambient`` [deg C]."""
-    return ambient + (torque / ratings.motor_constant) ** 2 * ratings.thermal_resistance
-
-
-def seconds_until_hot(torque: Floats, ratings: Ratings, ambient: float) -> Floats:
-    """(D,) [s] until a winding that begins at ``ambient`` has HOT; infinite if it never does, NaN if unknown.
-
-    First order: thermal_time * dT/dt = settled - T. Its strides must be short beside ``thermal_time``, as they are.
-    """
-    rise, room = settled(torque, ratings, ambient) - ambient, HOT - ambient
-    share = room / np.maximum(rise, 1e-9)
-    time = -ratings.thermal_time * np.log1p(-np.minimum(share, 1.0 - 1e-12))
-    return np.where(np.isnan(rise) | np.isnan(time), np.nan, np.where(share < 1.0, time, np.inf))
-
-
-def highest_torque(speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
-    """(T, N, D) [N m] that a motor can push with at ``speed`` along its motion: flat to the knee, then a line to 0.
-
-    ``limit`` (D,): the simulation's torque limits, where no peak torque is known.
-    """
-    peak = np.where(np.isnan(ratings.peak_torque), limit, ratings.peak_torque)
-    top = np.where(np.isnan(ratings.top_speed), np.inf, ratings.top_speed)
-    knee = np.minimum(np.where(np.isnan(ratings.knee_speed), top, ratings.knee_speed), top)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        left = np.where(np.abs(speed) <= knee, 1.0, (top - np.abs(speed)) / (top - knee))
-    return peak * np.clip(np.nan_to_num(left, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
-
-
-def at_limit(torque: Floats, speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
-    """(D,) Share of time at the torque-speed limit or beyond; NaN for a motor without any limit.
-
-    A motor that brakes has ``limit`` (D,) at any speed.
-    """
-    most = np.where(torque * speed > 0.0, highest_torque(speed, ratings, limit), limit)
-    share = (np.abs(torque) >= AT_LIMIT * most).mean(axis=(0, 1))
-    known = np.isfinite(limit) | ~np.isnan(ratings.peak_torque)
-    return np.where(known, share, np.nan)
-
-
-def power(torque: Floats, speed: Floats, ratings: Ratings) -> Floats:
-    """(T, N) [W] from the battery: motion and the windings' heat, where a motor constant is known.
-
-    Motors that brake feed the others; what is left over does not count as given back.
-    """
-    heat = np.nan_to_num((torque / ratings.motor_constant) ** 2)
-    return np.maximum((torque * speed + heat).sum(axis=2), 0.0)
-
 
 # ---- figures of an export -------------------------------------------------------------------------------------------
 
@@ -189,8 +94,9 @@ def finish(
     """
     result: dict[str, Any] = {
         "joints": list(joints),
-        "ratings": ratings.to_dict(),
-        "unknown": ratings.unknown(),
+        "ratings": {name: found for name in TABLES if any(map(bool, found := _plain(getattr(ratings, name))))},
+        BATTERY: None if math.isnan(ratings.battery_power) else ratings.battery_power,
+        "unknown": unknown(ratings),
         "phases": {name: phase(each, ratings, limit) if each else None for name, each in motions.items()},
         "switch": switched(switch, ratings, joints) if switch else None,
         "switches": switches,
@@ -198,9 +104,15 @@ def finish(
     return {**result, "reasons": (found := reasons(result)), "trips": True if found else _verdict(result)}
 
 
+def unknown(ratings: Ratings) -> list[str]:
+    """Names of the ratings that a motor or the battery lacks, of those that say whether it trips."""
+    heat = [name for name in ("continuous_torque", *THERMAL) if np.isnan(getattr(ratings, name)).any()]
+    return [*heat, *([BATTERY] if math.isnan(ratings.battery_power) else [])]
+
+
 def reasons(result: Mapping[str, Any]) -> list[str]:
     """Why it may trip, in words; empty if nothing that is known says so."""
-    found, most = [], result["ratings"].get("battery_power")
+    found, most = [], result[BATTERY]
     for name, each in result["phases"].items():
         if not each:
             continue
@@ -227,14 +139,16 @@ def _verdict(result: Mapping[str, Any]) -> bool | None:
     """False if all that could trip is known, else None. The winding's figures or the continuous torque are enough."""
     lacking = set(result["unknown"])
     heat = "continuous_torque" in lacking and bool(lacking & set(THERMAL))
-    return None if heat or "battery_power" in lacking or None in result["phases"].values() else False
+    return None if heat or BATTERY in lacking or None in result["phases"].values() else False
 
 
 # ---- words ----------------------------------------------------------------------------------------------------------
 
 
 _UNKNOWN = "unknown"
-LEAD = f"the {{count}} most loaded of {{motors}} motors, with minutes until a winding has {HOT:g} C where they are known"
+LEAD = (
+    f"the {{count}} most loaded of {{motors}} motors, with minutes until a winding has {HOT:g} C where they are known"
+)
 
 
 def lines(result: Mapping[str, Any]) -> list[str]:
@@ -271,7 +185,9 @@ def _heat_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
     if (hot := _least(each["minutes"][cool])) is not None:
         return f"{_short(result, hot)} reaches {HOT:g} C after {each['minutes'][cool][hot]:.0f} min at {cool} C"
     if (warm := _most(each["settles"][cool])) is not None:
-        return f"the warmest winding, {_short(result, warm)}, settles at {each['settles'][cool][warm]:.0f} C at {cool} C"
+        return (
+            f"the warmest winding, {_short(result, warm)}, settles at {each['settles'][cool][warm]:.0f} C at {cool} C"
+        )
     if (near := _most(each["of_rating"])) is not None:
         share = f"{each['rms'][near]:.1f} N m RMS, {each['of_rating'][near]:.2f} of its continuous rating"
         return f"{_short(result, near)} carries {share}; minutes until {HOT:g} C are unknown"
@@ -292,7 +208,7 @@ def _limit_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
 
 
 def _power_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
-    most, losses = result["ratings"].get("battery_power"), "motor_constant" not in result["unknown"]
+    most, losses = result[BATTERY], "motor_constant" not in result["unknown"]
     gives = "what the battery gives is unknown" if most is None else f"the battery gives {_watts(most)}"
     what = "" if losses else " without the windings' losses, which are unknown"
     return f"{_watts(each['mean_power'])} mean, {_watts(each['peak_power'])} at most{what}; {gives}"

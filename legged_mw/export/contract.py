@@ -28,11 +28,11 @@ from legged_mw.deploy.contract import (
     Gait,
     HeightScan,
     Motors,
+    make_ratings,
     target_range,
 )
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.eval.heat import Ratings
 from legged_mw.envs.motors import OWN as OWN_LAW
 from legged_mw.envs.motors import motor_drive
 from legged_mw.envs.robot_task import RobotTask
@@ -94,7 +94,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=_exam(task),
         motors=_motors(env, folder),
-        ratings=Ratings.of(env.ratings, cfg.ratings.battery_power or None, len(robot.joint_names)),
+        ratings=make_ratings(env.ratings, cfg.ratings.battery_power or None, len(robot.joint_names)),
         motion=_motion(env, folder),
         estimate=_estimated(env, task),
         scene=digest(folder / SCENE_FILE),
