@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import math
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from legged_mw.deploy.contract import make_ratings
-from legged_mw.eval import heat
+from legged_mw import ROOT
+from legged_mw.deploy import heat_exam
+from legged_mw.deploy.contract import make_ratings, read_contract
+from legged_mw.deploy.exam import contract_rules, contract_skill
+from legged_mw.deploy.hard_exam import Witness
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.envs.robot_task import motor_ratings
+from legged_mw.eval import heat, report
 from legged_mw.eval.heat import Motion, Switch
+from legged_mw.eval.report import Column
 from legged_mw.utils import motor_heat
+from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.motor_heat import Ratings
+from legged_mw.utils.task import load_task
 
+POLICIES = ROOT / "resources/policies"
+GO2 = POLICIES / "go2_flat"
 LIMIT = np.array([20.0, 50.0])
 
 
@@ -113,3 +127,88 @@ def test_without_ratings_all_but_the_figures_is_unknown() -> None:
     assert "unknown" in heat.table(result) and len(heat.rows(result)) == 3 and len(heat.rows(result, 1)) == 2
     fell = heat.finish(("hip", "knee"), ratings(), LIMIT, {"standing": None}, None)
     assert fell["trips"] is None and "fell" in heat.table(fell)
+
+
+# ---- on an export ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, seconds in {"STAND": 0.4, "AFTER": 0.2, "SETTLING": 0.2, "SECONDS": 1.0}.items():
+        monkeypatch.setattr(heat_exam, name, seconds)
+
+
+def test_a_robot_that_stands_and_walks(short_runs: None) -> None:
+    """A Go2's calves carry its weight; the policy's first target is off the pose, and what the curve allows is known."""
+    contract = read_contract(GO2)
+    result = heat_exam.run_heat(GO2, contract_rules(contract))
+    assert list(result["phases"]) == ["standing", "walking"] and result["trips"] is None
+    standing, walking = result["phases"].values()
+    assert 3.0 < standing["rms"][2] < 9.0 and walking["mean_power"] > standing["mean_power"] + 5.0
+    assert result["switch"]["target_jump"] > 0.05 and result["switch"]["peak_power"] > 5.0
+    assert {"peak_torque", "knee_speed", "top_speed"} == set(result["ratings"])
+    assert "Heat and power" in report._heats([Column("a", {}, {"heat": result})])
+
+
+def test_the_recorded_torque_is_the_looked_at_one() -> None:
+    """As the witness of the hard exam has it, which computes it from MuJoCo's data."""
+    seen: list[Any] = []
+    stage = DeployStage(GO2, 1, each=lambda: seen.append((recorder.sample(), witness.sample())))
+    recorder, witness = heat_exam.Recorder(stage.fleet), Witness(stage.fleet)
+    stage.step()
+    torque, speed = recorder.take()
+    np.testing.assert_allclose(torque[:, 0], [row["torque"] for row in witness._rows], atol=1e-9)
+    np.testing.assert_allclose(speed[:, 0], [row["speed"] for row in witness._rows], atol=1e-9)
+    assert torque.shape == (5, 1, 12) and np.abs(torque).max() > 1.0
+
+
+def test_a_skill_has_no_switch(short_runs: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = POLICIES / "go1_handstand"
+    skill = contract_skill(read_contract(folder))
+    monkeypatch.setattr(heat_exam, "TRIES", 2)
+    result = heat_exam.run_heat(folder, skill)
+    assert list(result["phases"]) == ["handstand"] and result["switch"] is None
+    assert max(result["phases"]["handstand"]["rms"]) > 5.0
+
+
+# ---- ratings in a contract and a config -----------------------------------------------------------------------------
+
+
+def with_ratings(folder: Path, ratings: Any) -> Path:
+    """A copy of the Go2's export with this section, edited by hand; None: without it."""
+    shutil.copytree(GO2, folder)
+    said = load_yaml(folder / "policy.yaml")
+    said.pop("ratings")
+    save_yaml(folder / "policy.yaml", said | ({"ratings": ratings} if ratings is not None else {}))
+    return folder
+
+
+def test_a_user_adds_ratings_in_three_lines(tmp_path: Path, short_runs: None) -> None:
+    """The contract stays sealed; a number for all, or one a joint with unknown ones."""
+    calves = [None, None, 5.0] * 4
+    folder = with_ratings(tmp_path / "go2", {"continuous_torque": calves, **WINDING, "battery_power": 5})
+    contract = read_contract(folder)
+    assert contract.ratings and contract.ratings.thermal_time.tolist() == [300.0] * 12
+    assert contract.to_dict()["ratings"]["continuous_torque"] == calves and np.isnan(contract.ratings.knee_speed).all()
+    result = heat_exam.run_heat(folder, contract_rules(contract))
+    assert result["trips"] and any("at the switch" in each for each in result["reasons"])
+
+
+def test_contracts_without_ratings_are_read(tmp_path: Path, short_runs: None) -> None:
+    folder = with_ratings(tmp_path / "go2", None)
+    contract = read_contract(folder)
+    assert contract.ratings is None and "ratings" not in contract.to_dict()
+    result = heat_exam.run_heat(folder, contract_rules(contract))
+    assert result["ratings"] == {} and result["trips"] is None and result["phases"]["walking"]["rms"][0] > 0.0
+
+
+def test_the_config_gives_the_contract_its_ratings() -> None:
+    """By keys that are parts of names: of a G1's 29 joints the six that two motors turn have no curve."""
+    contract = read_contract(POLICIES / "g1_flat")
+    assert contract.ratings
+    unknown = [name for name, peak in zip(contract.joints, contract.ratings.peak_torque, strict=True) if np.isnan(peak)]
+    assert unknown == [name for name in contract.joints if "ankle" in name or name.startswith(("waist_r", "waist_p"))]
+    env = load_task("g1_flat")
+    robot = SimpleNamespace(joint_names=contract.joints, held=())
+    again = make_ratings(motor_ratings(env.cfg, robot), None, 29)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(np.array(again[:-1]), np.array(contract.ratings[:-1]))
