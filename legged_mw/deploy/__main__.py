@@ -11,7 +11,7 @@ from legged_mw import ROOT
 from legged_mw.deploy import drive, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, edits, read_contract
 from legged_mw.deploy.drive import lift
-from legged_mw.deploy.exam import SwitchStage, contract_skill, run_exam, run_skill
+from legged_mw.deploy.exam import SwitchStage, contract_rules, contract_skill, run_exam, run_skill
 from legged_mw.deploy.hard_exam import run_hard
 from legged_mw.deploy.heat_exam import run_heat
 from legged_mw.deploy.odometry import CONTACTS
@@ -20,6 +20,7 @@ from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import heat, walking
 from legged_mw.eval.hard import table
+from legged_mw.eval.skills import Skill
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import check_folder, typed, writable
@@ -298,13 +299,13 @@ def examine(
             raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
         if isinstance(scene, Path):
             raise UserError("--scene is of robots that walk, and this exam has grounds of its own: leave it out")
-        skill = contract_skill(contract)
-        result, rules = run_skill(folder, skill, edited=edited), skill
-        print(skill.table(result))
+        rules: walking.ExamRules | Skill = contract_skill(contract)
+        result = run_skill(folder, rules, edited=edited)
+        print(rules.table(result))
     else:
-        result = run_exam(folder, common=common, contact=contact, edited=edited, scene=scene)
+        rules = contract_rules(contract, common)
+        result = run_exam(folder, rules, contact=contact, edited=edited, scene=scene)
         print(walking.table(result))
-        rules = walking.ExamRules.from_mapping(result["rules"])
         if hard and contract.feet:
             result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene)
             print(f"\n{table(result['hard'])}")

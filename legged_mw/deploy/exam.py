@@ -32,7 +32,7 @@ def run(folder: Path, exam: ExamRules | Skill, hard: bool = True) -> tuple[dict[
 
     Of a walk then the hard exam too, and a PNG of one stride.
     """
-    heat = {"heat": run_heat(folder, exam)} if hard else {}
+    heat: dict[str, Any] = {"heat": run_heat(folder, exam)} if hard else {}
     if isinstance(exam, Skill):
         return run_skill(folder, exam) | heat, b""
     result, contract = run_exam(folder, exam) | heat, read_contract(folder)
