@@ -202,8 +202,8 @@ def _limit_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
     near = _most(each["at_limit"])
     if near is None:
         return "the motors' torque-speed limits are unknown"
-    if not each["at_limit"][near]:
-        return "no motor is at its torque-speed limit"
+    if each["at_limit"][near] < 0.0005:
+        return "no motor is at its torque-speed limit for 0.1% of the time"
     return f"{_short(result, near)} is at its torque-speed limit {each['at_limit'][near]:.1%} of the time"
 
 
