@@ -59,7 +59,7 @@ def touch(env: LeggedRobot, *feet: tuple[float, float]) -> None:
 
 def test_every_term_has_a_figure() -> None:
     methods = {name.removeprefix("_reward_") for name in dir(LeggedRobot) if name.startswith("_reward_")}
-    assert methods == {*test_rewards.EXPECTED, "target_limits", *TERMS, *FEET, *test_forces.SCALES}
+    assert methods == {*test_rewards.EXPECTED, "target_limits", "motor_heat", *TERMS, *FEET, *test_forces.SCALES}
 
 
 # ---- base and joints
@@ -108,6 +108,13 @@ def test_torques_as_squares() -> None:
     assert term(env, "torques") == [25.0, 6.0]
     env.cfg.rewards.torques_as = "norms"
     assert term(env, "torques") == pytest.approx([5.0 + 7.0, 6**0.5 + 6.0])
+
+
+def test_motor_heat() -> None:
+    """Two hips of 4 N m; the other joints have no rating and do not count."""
+    env = biped({"rewards.scales.motor_heat": -1.0, "ratings.continuous_torque": {"hip": 4.0}})
+    env.sim.actuator_force[:] = torch.tensor([[3.0, 9.0, 9.0, -8.0, 9.0, 9.0], [0.0, 1.0, 1.0, 4.0, 1.0, 1.0]])
+    assert term(env, "motor_heat") == pytest.approx([(0.75**2 + 4.0) / 2, 0.5])
 
 
 @pytest.mark.parametrize("wanted", [["hip"], ["*_hip"], ["left_hip", "right_hip"]])

@@ -26,6 +26,16 @@ class G1(RobotTaskCfg):
                         "hip_roll": 0.35, "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # fmt: skip
         decimation = 4
 
+    class ratings(RobotTaskCfg.ratings):
+        # Unitree's unitree_rl_lab, unitree_actuators.py: N7520-14.3, N7520-22.5, N5020-16, W4010-25. Unknown of ankles
+        # and of waist roll and pitch, which two motors turn together. No other figure is known to us: docs/heat.md
+        peak_torque = {"hip": 71.0, "waist_yaw": 71.0, "hip_roll": 111.0, "knee": 111.0, "shoulder": 24.8,  # [N m]
+                       "elbow": 24.8, "wrist_roll": 24.8, "wrist": 4.8}  # fmt: skip
+        knee_speed = {"hip": 22.63, "waist_yaw": 22.63, "hip_roll": 14.5, "knee": 14.5, "shoulder": 30.86,  # [rad/s]
+                      "elbow": 30.86, "wrist_roll": 30.86, "wrist": 15.3}  # fmt: skip
+        top_speed = {"hip": 35.52, "waist_yaw": 35.52, "hip_roll": 22.7, "knee": 22.7, "shoulder": 40.13,  # [rad/s]
+                     "elbow": 40.13, "wrist_roll": 40.13, "wrist": 24.76}  # fmt: skip
+
     class sim(RobotTaskCfg.sim):
         dt, iterations, ls_iterations = 0.005, 3, 10  # [s] [M], [ours: soles slip with 1; docs/lab.md]
 

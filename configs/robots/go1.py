@@ -25,6 +25,10 @@ class Go1(RobotTaskCfg):
         stiffness = {"joint": 35.0}  # [N m/rad] [P]
         damping = {"joint": 0.5}  # [N m s/rad] [P]
 
+    class ratings(RobotTaskCfg.ratings):
+        # Of the motors (GO-M8010-6) and the battery no other figure is known to us: docs/heat.md
+        top_speed = {"hip": 30.1, "thigh": 30.1, "calf": 20.06}  # [rad/s], of joint_speed_limits
+
 
 class WalkingGo1(Go1, LeggedRobotCfg):
     class asset(Go1.asset, LeggedRobotCfg.asset):

@@ -23,6 +23,13 @@ class Go2(RobotTaskCfg):
         stiffness = {"": 20.0}  # [N m/rad] [U]
         damping = {"": 0.5}  # [N m s/rad] [U]
 
+    class ratings(RobotTaskCfg.ratings):
+        # Unitree's unitree_rl_lab, unitree_actuators.py, "Go2HV"; a calf's by its lever, 1.917, as its limits of 45.43 N m
+        # and 15.7 rad/s are. Of motors and battery no other figure is known to us: docs/heat.md
+        peak_torque = {"": 20.2, "calf": 38.7}  # [N m]
+        knee_speed = {"": 13.5, "calf": 7.04}  # [rad/s]
+        top_speed = {"": 30.0, "calf": 15.65}  # [rad/s]
+
 
 class WalkingGo2(Go2, LeggedRobotCfg):
     class asset(Go2.asset, LeggedRobotCfg.asset):

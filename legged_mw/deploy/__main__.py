@@ -11,14 +11,16 @@ from legged_mw import ROOT
 from legged_mw.deploy import drive, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, edits, read_contract
 from legged_mw.deploy.drive import lift
-from legged_mw.deploy.exam import SwitchStage, contract_skill, run_exam, run_skill
+from legged_mw.deploy.exam import SwitchStage, contract_rules, contract_skill, run_exam, run_skill
 from legged_mw.deploy.hard_exam import run_hard
+from legged_mw.deploy.heat_exam import run_heat
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import walking
+from legged_mw.eval import heat, walking
 from legged_mw.eval.hard import table
+from legged_mw.eval.skills import Skill
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import check_folder, typed, writable
@@ -145,7 +147,9 @@ def parse() -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam, in a third of the time")
+    parser.add_argument(
+        "--no_hard", action="store_true", help="--eval without the hard exam and heat, in a third of the time"
+    )
     parser.add_argument(
         "--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name"
     )
@@ -288,7 +292,7 @@ def examine(
 ) -> None:
     """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage.
 
-    ``hard``: the hard exam too, of a policy that walks. ``scene``: ``scene_file`` of DeployStage.
+    ``hard``: heat and power too, and of a policy that walks the hard exam. ``scene``: ``scene_file`` of DeployStage.
     """
     contract = read_contract(folder, edited)
     writable(str(path), "--out")
@@ -299,16 +303,19 @@ def examine(
             raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
         if isinstance(scene, Path):
             raise UserError("--scene is of robots that walk, and this exam has grounds of its own: leave it out")
-        skill = contract_skill(contract)
-        result = run_skill(folder, skill, edited=edited)
-        print(skill.table(result))
+        rules: walking.ExamRules | Skill = contract_skill(contract)
+        result = run_skill(folder, rules, edited=edited)
+        print(rules.table(result))
     else:
-        result = run_exam(folder, common=common, contact=contact, edited=edited, scene=scene)
+        rules = contract_rules(contract, common)
+        result = run_exam(folder, rules, contact=contact, edited=edited, scene=scene)
         print(walking.table(result))
         if hard and contract.feet:
-            rules = walking.ExamRules.from_mapping(result["rules"])
             result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene)
             print(f"\n{table(result['hard'])}")
+    if hard:
+        result["heat"] = run_heat(folder, rules, edited, scene)
+        print(f"\n{heat.table(result['heat'])}")
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"scene": shown(scene)} if isinstance(scene, Path) else {}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}

@@ -23,6 +23,7 @@ from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError, brief, unknown
 from legged_mw.utils.files import digest, finish_moving
+from legged_mw.utils.motor_heat import BATTERY, TABLES, Ratings
 from legged_mw.utils.motor_network import (
     DC_CONSTANT,
     DC_DAMPING,
@@ -159,7 +160,7 @@ class Action(NamedTuple):
         return values | {"scale": short(values["scale"])}
 
 
-def short(values: Sequence[float]) -> float | list[float]:
+def short(values: Sequence[Any]) -> Any:
     """One number if all are equal, else the list."""
     return values[0] if len(set(values)) == 1 else list(values)
 
@@ -353,6 +354,43 @@ class Motors(NamedTuple):
 
 
 SERVOS = Motors()
+RATINGS = "ratings"
+
+
+def make_ratings(tables: Mapping[str, Sequence[float | None]], battery_power: float | None, joints: int) -> Ratings:
+    """Ratings from lists (D,), None where unknown; a table that is left out is unknown."""
+    full = {name: np.array(tables.get(name, [None] * joints), dtype=float) for name in TABLES}
+    return Ratings(**full, battery_power=math.nan if battery_power is None else battery_power)
+
+
+def read_ratings(section: Reader, joints: int) -> Ratings:
+    """Read the section ``ratings``: of each table a number for all motors, or one a joint, null where unknown."""
+    for name in section.values:
+        if name not in Ratings._fields:
+            raise ContractError(f"{section.where}: {unknown('rating', name, Ratings._fields, RATINGS)}")
+    tables, wanted = {}, f"a number above zero, or {joints} of them, one a joint, null where unknown"
+    for name in TABLES:
+        if name in section.values:
+            value = section.take(name, wanted, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints))
+            tables[name] = value if isinstance(value, list) else [value] * joints
+    return make_ratings(tables, section.above_zero(BATTERY) if BATTERY in section.values else None, joints)
+
+
+def ratings_to_dict(ratings: Ratings) -> dict[str, Any]:
+    """The section ``ratings``: what is known, one number where all motors have the same; empty if nothing is."""
+    known = {name: values for name in TABLES if not np.isnan(values := getattr(ratings, name)).all()}
+    lists = {name: [None if math.isnan(value) else value for value in known[name].tolist()] for name in known}
+    battery = {} if math.isnan(ratings.battery_power) else {BATTERY: ratings.battery_power}
+    said = {name: short(values) for name, values in lists.items()} | battery
+    return {RATINGS: said} if said else {}
+
+
+def _rates(value: object) -> bool:
+    return is_number(value) and 0 < value <= MOST  # type: ignore[operator]
+
+
+def _rates_or_none(value: object) -> bool:
+    return value is None or _rates(value)
 
 
 def read_motors(section: Reader, joints: int) -> Motors:
@@ -550,6 +588,7 @@ class Contract:
     memory: NetworkMemory | None = None  # of a recurrent network
     estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
+    ratings: Ratings | None = None  # what the motors and the battery bear; None: the contract does not say
     motion: FollowedMotion | None = None  # of a policy that follows one
     scene: str = ""  # SHA-256 of the scene's file; empty in formats before 5
     terrain: str = ""  # SHA-256 of the scene with steps, if there is one
@@ -606,6 +645,7 @@ class Contract:
             **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
             **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
             **self.motors.to_dict(),
+            **(ratings_to_dict(self.ratings) if self.ratings else {}),
             **({MOTION: self.motion.to_dict()} if self.motion else {}),
         }
         return sealed(said)
@@ -729,6 +769,7 @@ def _read(top: Reader, folder: Path) -> Contract:
         memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
         estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
         motors=read_motors(top.section(MOTORS), count) if MOTORS in top.values else SERVOS,
+        ratings=read_ratings(top.section(RATINGS), count) if RATINGS in top.values else None,
         motion=read_motion(top.section(MOTION)) if MOTION in top.values else None,
         **_read_scenes(physics, version),
     )
@@ -858,7 +899,8 @@ def _check_rows(contract: Contract) -> None:
 
 CHECKSUM = "checksum"  # of the values that must not change without the network
 EXPORTED = "exported"  # those values at the export: base64 of zlib of JSON
-FREE = ("task", "ends", "exam", "safety")  # sections that may change: how the policy is graded and supervised
+# sections that may change: how the policy is graded and supervised, and what is known of the robot's motors
+FREE = ("task", "ends", "exam", "safety", RATINGS)
 _MOST_TEXT = 1 << 22  # [byte] limit of the unpacked `exported`; a G1's has a four-hundredth
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from legged_mw.deploy.contract import CONTRACT_FILE, OWN, SCENE_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.hard_exam import run_hard, strip_png
+from legged_mw.deploy.heat_exam import run_heat
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import walking
@@ -27,10 +28,14 @@ from legged_mw.utils.errors import UserError, unknown
 
 
 def run(folder: Path, exam: ExamRules | Skill, hard: bool = True) -> tuple[dict[str, Any], bytes]:
-    """Grade the export in ``folder`` by the rules ``exam``; a walk by the hard exam too, and a PNG of one stride."""
+    """Grade the export in ``folder`` by the rules ``exam``, with ``hard`` also its heat and power.
+
+    Of a walk then the hard exam too, and a PNG of one stride.
+    """
+    heat: dict[str, Any] = {"heat": run_heat(folder, exam)} if hard else {}
     if isinstance(exam, Skill):
-        return run_skill(folder, exam), b""
-    result, contract = run_exam(folder, exam), read_contract(folder)
+        return run_skill(folder, exam) | heat, b""
+    result, contract = run_exam(folder, exam) | heat, read_contract(folder)
     if not hard or not contract.feet:
         return result, b""
     result["hard"], poses = run_hard(folder, exam, result["walks"])

@@ -124,6 +124,7 @@ class Fleet:
         # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
         self.qpos: Floats = self._batch.bind("qpos")
         self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written here
+        self._forces: Floats = self._batch.bind("qfrc_actuator")  # (N, nv) of the last physics step
         self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
         self._where, self._contacts = scene.sensordata, scene.contacts
         # (N,) MuJoCo could not step the robot, since its reset
@@ -164,6 +165,15 @@ class Fleet:
                 self._each()
         if self._each:
             self.refresh()
+
+    def motor_torque(self) -> Floats:
+        """(N, D) [N m] of each motor in the last physics step; a servo's damping is its own, not the joint's."""
+        damping = self.contract.damping if self.damps_by_joint else 0.0
+        return self._forces[:, self._dofs] - damping * self.qvel[:, self._dofs]
+
+    def motor_speed(self) -> Floats:
+        """(N, D) [rad/s]"""
+        return self.qvel[:, self._dofs].copy()
 
     def _arrived(self, step: int) -> Floats:
         """What the motors (N, D) have in this physics step of a period."""

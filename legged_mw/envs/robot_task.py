@@ -34,7 +34,7 @@ from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import BrokenWorlds, NonFinite, Statistics
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.joints import PARTIAL
+from legged_mw.sim.joints import PARTIAL, some_joints
 from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, standing_height
 from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT, SENSORS
@@ -534,6 +534,9 @@ class RobotTask(BaseTask):
         self.default_dof_pos = self._tensor(self.robot.pose)
         self.pose_weights = self._tensor(self.robot.tables["rewards.pose_weights"])  # (D,)
         self.deviation_weights = self._tensor(self.robot.tables["rewards.deviation_weights"])  # (D,)
+        self.ratings = motor_ratings(cfg, self.robot)
+        rated = self.ratings["continuous_torque"]
+        self.rated_torque = self._tensor([math.inf if torque is None else torque for torque in rated])  # (D,) [N m]
         self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
         # `soft_dof_pos_limit` of each joint's range, about its middle; infinite where it has no limits
         middle = (self.joint_lower + self.joint_upper) / 2
@@ -712,6 +715,12 @@ class RobotTask(BaseTask):
             return self.torques.square().sum(dim=1)
         return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
 
+    def _reward_motor_heat(self) -> Tensor:
+        """Mean square of torque over ``ratings.continuous_torque``, of the joints that have one. [ours]"""
+        needed = "ratings.continuous_torque is empty; write what the motors bear for ever [N m] (docs/heat.md)"
+        require(bool(self.cfg.ratings.continuous_torque), "motor_heat", needed)
+        return (self.torques / self.rated_torque).square().sum(dim=1) / self.rated_torque.isfinite().sum()
+
     def _reward_action_rate(self) -> Tensor:
         """Change of the clipped action, squared. [L]"""
         return (self.actions - self.last_actions).square().sum(dim=1)
@@ -774,6 +783,13 @@ def load_robot(
         )
     except ModelError as error:
         raise error.renamed(FIELDS) from None
+
+
+def motor_ratings(cfg: RobotTaskCfg, robot: RobotModel) -> dict[str, list[float | None]]:
+    """The tables of ``cfg.ratings``: name -> (D,), None where unknown. Raises ModelError for a key that fits no joint."""
+    tables = {name: table for name, table in cfg.to_dict()["ratings"].items() if isinstance(table, Mapping)}
+    known = {name: some_joints(tables[name], robot.joint_names, f"ratings.{name}", robot.held) for name in tables}
+    return {name: [found.get(joint) for joint in robot.joint_names] for name, found in known.items()}
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:

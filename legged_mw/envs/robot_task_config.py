@@ -115,6 +115,22 @@ class RobotTaskCfg(Config):
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
         decimation: SmallInt = 5  # simulation steps a control step [P]
 
+    class ratings:
+        """What the motors and the battery bear; empty: unknown. For the exam's heat and power, and for `motor_heat`.
+
+        Tables a joint that need not name every joint; all values are at the joint (docs/heat.md).
+        """
+
+        continuous_torque: dict[str, Positive] = {}  # RMS that it bears for ever [N m]
+        # torque per root of the heat in the winding: torque constant * gear / sqrt(resistance) [N m/W^0.5]
+        motor_constant: dict[str, Positive] = {}
+        thermal_resistance: dict[str, Positive] = {}  # from the winding to the room [K/W]
+        thermal_time: dict[str, Positive] = {}  # time constant of the winding [s]
+        peak_torque: dict[str, Positive] = {}  # up to knee_speed; without it the servo's highest force [N m]
+        knee_speed: dict[str, Positive] = {}  # from here the torque falls to 0 at top_speed [rad/s]
+        top_speed: dict[str, Positive] = {}  # without load [rad/s]
+        battery_power: NonNegative = 0.0  # the most that the battery gives; 0: unknown [W]
+
     class observations:
         leave_out: dict[str, list[str]] = {}  # group -> rows of the table to drop: {"state": ["base_lin_vel"]}
         history: dict[str, Count] = {}  # group, or "group.row" -> frames of each row, oldest first: {"state": 5}

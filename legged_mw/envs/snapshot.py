@@ -14,7 +14,14 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.simulation import CONSTANTS_READ
 
 MOST = 1e10  # a state beyond it has blown up for MuJoCo: mjMAXVAL
-_FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections of the config that a resumed run may change
+_FREE = (
+    "rewards",
+    "noise",
+    "viewer",
+    "exam",
+    "ratings",
+    "termination",
+)  # sections of the config that a resumed run may change
 
 
 def memory(env: RobotTask) -> dict[str, Tensor]:

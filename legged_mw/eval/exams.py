@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.eval import hard, perform, report, rollout, rough, walking
+from legged_mw.eval import hard, heat, perform, report, rollout, rough, walking
 from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Policy, TrainingExam
 from legged_mw.eval.skills import SKILLS, Skill
@@ -150,8 +150,9 @@ def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namesp
     columns = [make_column(*each) for each in built]
     columns[1:1] = elsewhere(graded[0])
     for column in columns[1:]:
-        if "hard" in column.exam:
-            print(f"{column.name}\n{hard.table(column.exam['hard'])}\n")
+        for name, text in (("hard", hard.table), ("heat", heat.table)):
+            if name in column.exam:
+                print(f"{column.name}\n{text(column.exam[name])}\n")
     graded[0].exam.write(folder, graded[0].task.name, columns)
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from legged_mw.eval import hard
+from legged_mw.eval import hard, heat
 from legged_mw.eval.walking import AXES, LEVELS, PUSH_DIRECTIONS, ExamRules, Figure, best_of, verdicts
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 TEXTS = {
     "hard": "{count} commands of 6 s and {pushes} pushes from all sides under each condition alone, then all of them: 10 ms, gains x 0.9, "
     "load, friction 0.5, noise. Below: how it looks while it walks at {vx:g} m/s, with the marks of ready for a robot.",
+    "heat": "One robot in MuJoCo's C engine: held in its default pose, then by the policy standing, then walking at half of the highest "
+    "speed; a skill as in its exam. What nobody published of the motors and the battery is unknown (docs/heat.md).",
     "crossing": "Commanded ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
     "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
     "ground; below it stands what makes it hard, level by level. Dark is good.",
@@ -88,7 +90,7 @@ def walking_page(
     header = f"""{_names(columns, rules)}{_cards(figures[0])}</header>
 <section><h2>Exam</h2><p class="lead">{note}</p>{exam_table(columns, figures, rules.peer_label)}</section>"""
     published = _published(rules, columns) if len(rules.peers) > 1 else ""
-    harder = "".join(_hard(column) for column in columns if "hard" in column.exam)
+    harder = "".join(_hard(column) for column in columns if "hard" in column.exam) + _heats(columns)
     return _page(task, "walking exam", "Walking exam", f"{header}\n{harder}{''.join(chapters)}{published}", columns)
 
 
@@ -116,6 +118,19 @@ def _hard(column: Column) -> str:
     strip = picture(column.strip, "one stride, from the side and from the front") if column.strip else ""
     said = f'<p class="lead">{lead}</p>{pill("ready for a robot", "not ready for a robot", result["ready"])}{missed}'
     return f"<section><h2>Hard exam</h2>{said}{table(heads, rows)}{looked}{strip}</section>"
+
+
+def _heats(columns: Sequence[Column]) -> str:
+    """The chapters of heat and power: verdict, one line each, a row a motor."""
+    chapters = []
+    for result in (column.exam["heat"] for column in columns if "heat" in column.exam):
+        *said, _ = (f"<li>{escape(line)}</li>" for line in heat.lines(result))
+        heads, *rows = heat.rows(result)
+        verdict = f"<p><b>Will it trip?</b> {escape(heat.verdict(result))}</p>"
+        lead = f'<p class="lead">{TEXTS["heat"]}</p>'
+        body = f"{lead}{verdict}<ul>{''.join(said)}</ul>{table(heads, rows, 'Motor by motor')}"
+        chapters.append(f"<section><h2>Heat and power</h2>{body}</section>")
+    return "".join(chapters)
 
 
 def _names(columns: Sequence[Column], rules: ExamRules) -> str:
@@ -328,7 +343,7 @@ def skill_page(task: str, skill: Skill, columns: Sequence[Column], strips: Mappi
         strip = picture(strips[part], part) if part in strips else ""
         sections.append(f"<section><h2>{escape(part)}</h2>{exam_table(columns, figures, '', 'asks')}{strip}</section>")
     header = f'<ul class="names">{"".join(passed)}</ul></header>\n<p class="lead">{escape(skill.asks)}</p>'
-    return _page(task, skill.kind, f"Exam: {skill.kind}", header + "".join(sections), columns)
+    return _page(task, skill.kind, f"Exam: {skill.kind}", header + "".join(sections) + _heats(columns), columns)
 
 
 def picture(png: bytes, name: str) -> str:

@@ -28,6 +28,7 @@ from legged_mw.deploy.contract import (
     Gait,
     HeightScan,
     Motors,
+    make_ratings,
     target_range,
 )
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -93,6 +94,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=_exam(task),
         motors=_motors(env, folder),
+        ratings=make_ratings(env.ratings, cfg.ratings.battery_power or None, len(robot.joint_names)),
         motion=_motion(env, folder),
         estimate=_estimated(env, task),
         scene=digest(folder / SCENE_FILE),

@@ -94,7 +94,9 @@ def parse(description: str | None) -> argparse.Namespace:
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--no_hard", action="store_true", help="--eval without the hard exam, in half the time")
+    parser.add_argument(
+        "--no_hard", action="store_true", help="--eval without the hard exam and heat, in half the time"
+    )
     parser.add_argument(
         "--export",
         metavar="DIR",

@@ -61,6 +61,7 @@ SETS = [
     "rewards.scales.orientation=.nan",
     "rewards.soft_dof_pos_limit=7",
     "rewards.pose_weights={'': -1}",
+    "ratings.continuous_torque={'': 0}",
     "noise.level=-1",
     "noise.scales.dof_vel=.nan",
     "normalization.clip_actions=-2",

@@ -63,6 +63,8 @@ FIELDS: dict[str, dict[str, Any]] = {
     "another value to sense": {"asset.sense": ["forces"]},
     "a flight of four feet": only_scales(no_fly=1.0),
     "a stance of four feet": only_scales(single_stance=1.0),
+    "heat without a rating": only_scales(motor_heat=-1.0),
+    "a rating of no joint": {"ratings.thermal_time": {"knee": 300.0}},
     "limits of targets that are torques": {**only_scales(target_limits=-1.0), "control.actuator": "torque"},
     "pushes of itself that cannot be": only_scales(self_collision=-1.0),
     "an end by what never touches": {
