@@ -109,6 +109,16 @@ def parse(description: str | None) -> argparse.Namespace:
     )
     args = parser.parse_args()
     require_task(args, parser)
+    check_together(args, parser)
+    launch.check_flags(args)
+    if args.export is not None:
+        writable(args.export, "--export", folder=True)
+    torch.set_num_threads(1)  # with few worlds, more threads are slower
+    return args
+
+
+def check_together(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Refuse flags that mean nothing together."""
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
@@ -125,11 +135,6 @@ def parse(description: str | None) -> argparse.Namespace:
         parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
     if (args.eval or args.export) and (watching := launch.asked(args)):
         parser.error(f"--eval and --export show nothing: leave {', '.join(watching)} out")
-    launch.check_flags(args)
-    if args.export is not None:
-        writable(args.export, "--export", folder=True)
-    torch.set_num_threads(1)  # with few worlds, more threads are slower
-    return args
 
 
 def prepare(
