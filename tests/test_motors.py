@@ -569,6 +569,7 @@ def test_a_robot_rolls_on_wheels_that_a_law_in_code_drives(engine: str, tmp_path
     car = {
         **{"asset.file": str(tmp_path / "car.xml"), "asset.foot_names": [*CORNERS], "asset.imu_site": ""},
         **{"asset.colliders": [*CORNERS], "asset.joint_speed_limits": {}, "asset.effort": {}},
+        "ratings.top_speed": {},
         **{
             "init_state.default_joint_angles": {"": 0.0},
             "init_state.pos": [],

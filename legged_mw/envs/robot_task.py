@@ -536,7 +536,8 @@ class RobotTask(BaseTask):
         self.deviation_weights = self._tensor(self.robot.tables["rewards.deviation_weights"])  # (D,)
         self.ratings = motor_ratings(cfg, self.robot)
         rated = self.ratings["continuous_torque"]
-        self.rated_torque = self._tensor([math.inf if torque is None else torque for torque in rated])  # (D,) [N m]
+        share = 1.0 / max(sum(torque is not None for torque in rated), 1)  # of a rated joint in their mean
+        self.heat_weights = self._tensor([share / torque**2 if torque else 0.0 for torque in rated])  # (D,) [1/(N m)^2]
         self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
         # `soft_dof_pos_limit` of each joint's range, about its middle; infinite where it has no limits
         middle = (self.joint_lower + self.joint_upper) / 2
@@ -719,7 +720,7 @@ class RobotTask(BaseTask):
         """Mean square of torque over ``ratings.continuous_torque``, of the joints that have one. [ours]"""
         needed = "ratings.continuous_torque is empty; write what the motors bear for ever [N m] (docs/heat.md)"
         require(bool(self.cfg.ratings.continuous_torque), "motor_heat", needed)
-        return (self.torques / self.rated_torque).square().sum(dim=1) / self.rated_torque.isfinite().sum()
+        return (self.torques.square() * self.heat_weights).sum(dim=1)
 
     def _reward_action_rate(self) -> Tensor:
         """Change of the clipped action, squared. [L]"""
