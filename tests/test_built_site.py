@@ -214,6 +214,7 @@ def test_which_pages_are_in_chinese() -> None:
         "your_own_robot",
         "on_the_robot",
         "coming_from",
+        "tutorial",
     }
 
 
