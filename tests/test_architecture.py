@@ -432,6 +432,16 @@ def test_no_two_packages_import_each_other() -> None:
     assert rounds(package_graph(back)) == [("deploy", "unitree")]
 
 
+def test_no_two_modules_name_a_class_alike() -> None:
+    """Who looks for a class by its name finds one; private ones are of their module."""
+    where: dict[str, list[str]] = {}
+    for path in (path for path in FILES if path.startswith(("legged_mw/", "configs/"))):
+        for node in ast.parse(SOURCES[path]).body:
+            if isinstance(node, ast.ClassDef):
+                where.setdefault(node.name, []).append(path)
+    assert len(where) > 100 and {name: paths for name, paths in where.items() if len(paths) > 1} == {}
+
+
 def test_functions_stay_readable() -> None:
     assert {path: long for path, source in SOURCES.items() if (long := too_long(source))} == {}
     silent = [path for path, source in SOURCES.items() if not ast.get_docstring(ast.parse(source))]

@@ -154,7 +154,7 @@ def test_the_recorded_torque_is_the_looked_at_one() -> None:
     """As the witness of the hard exam has it, which computes it from MuJoCo's data."""
     seen: list[Any] = []
     stage = DeployStage(GO2, 1, each=lambda: seen.append((recorder.sample(), witness.sample())))
-    recorder, witness = heat_exam.Recorder(stage.fleet), Witness(stage.fleet)
+    recorder, witness = heat_exam.MotorLog(stage.fleet), Witness(stage.fleet)
     stage.step()
     torque, speed = recorder.take()
     np.testing.assert_allclose(torque[:, 0], [row["torque"] for row in witness._rows], atol=1e-9)

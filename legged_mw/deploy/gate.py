@@ -155,7 +155,7 @@ def _short(value: Any) -> str:
 # ---- grading ----------------------------------------------------------------------------------------------------------
 
 
-class Graded(NamedTuple):
+class Repeat(NamedTuple):
     """One repeat of the exam."""
 
     verdicts: dict[str, bool]
@@ -187,7 +187,7 @@ def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Na
     }
 
 
-def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Namespace) -> Graded:
+def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Namespace) -> Repeat:
     """One repeat."""
     if exam["kind"] != "walking":
         skill = contract_skill(read_contract(folder, args.edited))
@@ -196,7 +196,7 @@ def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Names
         each = [
             figure._replace(name=f"{part}: {figure.name}") for part in parts for figure in skill.figures(parts, part)
         ]
-        return Graded({"passes": result["passed"]}, named(each))
+        return Repeat({"passes": result["passed"]}, named(each))
     rules, scene = ExamRules.from_mapping(exam["rules"]), typed(args.scene) if args.scene else SCENE_FILE
     result = run_exam(folder, rules, edited=args.edited, scene=scene, seed=seed)
     said, figures = {"walks": result["walks"]}, rules.figures(result)
@@ -204,7 +204,7 @@ def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Names
         harder, _ = run_hard(folder, rules, result["walks"], args.edited, scene, seed)
         said["ready for a robot"] = harder["ready"]
         figures += [*condition_figures(harder), *hard.figures(harder)]
-    return Graded(said, named(figures))
+    return Repeat(said, named(figures))
 
 
 def condition_figures(result: Mapping[str, Any]) -> list[Figure]:

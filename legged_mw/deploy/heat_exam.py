@@ -34,7 +34,7 @@ def run_heat(
     """
     contract, walks = read_contract(folder, edited), isinstance(exam, ExamRules)
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on) if walks else None  # as in run_exam
-    recorder: list[Recorder] = []
+    log: list[MotorLog] = []
     stage = DeployStage(
         folder,
         1 if walks else TRIES,
@@ -42,20 +42,20 @@ def run_heat(
         scene_file=scene,
         ends=ends,
         edited=edited,
-        each=lambda: recorder[0].sample(),
+        each=lambda: log[0].sample(),
     )
-    recorder.append(Recorder(stage.fleet))
+    log.append(MotorLog(stage.fleet))
     holds = walks and contract.action.origin not in ("torque", "speed")
     if isinstance(exam, ExamRules):
-        motions, switch = walk(stage, recorder[0], half_speed(exam), holds)
+        motions, switch = walk(stage, log[0], half_speed(exam), holds)
     else:
-        motions, switch = {exam.kind: perform(stage, recorder[0], exam)}, None
+        motions, switch = {exam.kind: perform(stage, log[0], exam)}, None
     joints = [stage.fleet.model.joint(name).id for name in contract.joints]
     ratings = contract.ratings or make_ratings({}, None, len(joints))
     return heat.finish(contract.joints, ratings, torque_limits(stage.fleet.model, joints), motions, switch, holds)
 
 
-class Recorder:
+class MotorLog:
     """Torque and speed of every motor at each physics step."""
 
     def __init__(self, fleet: Fleet) -> None:
@@ -75,21 +75,19 @@ class Recorder:
         return motion
 
 
-def walk(
-    stage: DeployStage, recorder: Recorder, vx: float, holds: bool
-) -> tuple[dict[str, Motion | None], Switch | None]:
+def walk(stage: DeployStage, log: MotorLog, vx: float, holds: bool) -> tuple[dict[str, Motion | None], Switch | None]:
     """A robot that its servos hold in the default pose (``holds``), then stands by its policy, then walks at ``vx``."""
     stand, ahead = (commands_of(stage.contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
-    switch = switch_over(stage, recorder, stage.contract, stand) if holds else None
+    switch = switch_over(stage, log, stage.contract, stand) if holds else None
     motions: dict[str, Motion | None] = {}
     for name, command in (("standing", stand), ("walking", ahead)):
         fell = _run(stage, SETTLING, command)
-        recorder.take()
-        motions[name] = None if _run(stage, SECONDS - SETTLING, command) or fell else recorder.take()
+        log.take()
+        motions[name] = None if _run(stage, SECONDS - SETTLING, command) or fell else log.take()
     return motions, switch
 
 
-def switch_over(stage: DeployStage, recorder: Recorder, contract: Contract, stand: Floats) -> Switch | None:
+def switch_over(stage: DeployStage, log: MotorLog, contract: Contract, stand: Floats) -> Switch | None:
     """Hold the default pose for STAND, then start the policy; None if the robot falls then.
 
     Meanwhile the root can sink but neither tilt nor slide, as if a person kept it upright: else a biped topples.
@@ -101,12 +99,12 @@ def switch_over(stage: DeployStage, recorder: Recorder, contract: Contract, stan
         fleet.qvel[0, [0, 1, 3, 4, 5]] = 0.0
         fleet.refresh()
     stage.measured = fleet.read()
-    before = recorder.take().torque[-1, 0]
+    before = log.take().torque[-1, 0]
     stage.step(stand)
     jump = stage.controller.last_targets[0] - contract.default_pose
     if _run(stage, AFTER - stage.dt, stand):
         return None
-    return Switch(fleet.model.opt.timestep, jump, before, recorder.take(), contract.period)
+    return Switch(fleet.model.opt.timestep, jump, before, log.take(), contract.period)
 
 
 def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
@@ -118,7 +116,7 @@ def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
     return fell
 
 
-def perform(stage: DeployStage, recorder: Recorder, skill: Skill) -> Motion | None:
+def perform(stage: DeployStage, log: MotorLog, skill: Skill) -> Motion | None:
     """Those of TRIES robots that do not fall, in the first of the exam's starts on its first ground, the task's own."""
     said, follower = stage.contract.motion, stage.controller.follower
     motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
@@ -129,5 +127,5 @@ def perform(stage: DeployStage, recorder: Recorder, skill: Skill) -> Motion | No
     for _ in range(skill.steps(robot)):
         stage.step()
         stands &= ~stage.fell()
-    torque, speed = recorder.take()
+    torque, speed = log.take()
     return Motion(torque[:, stands], speed[:, stands]) if stands.any() else None
