@@ -1,8 +1,8 @@
-"""The first walk: the list that a robot goes through before it is let go, each value beside that of the exam's robot.
+"""The first walk of a robot: six steps, each of whose values is compared with a simulated robot.
 
-Hanging, joint check, stand, emergency stop, ten steps on the spot, a metre ahead. The exam's robot, which is simulated
-from the export, does the same list first; what is measured of it is expected. Where a value differs by more than is
-allowed, the joints are damped and the list ends. A person presses a button before each step.
+The steps are hanging, joint check, stand, emergency stop, ten steps on the spot, a metre ahead. A person presses a
+button before each step. The exam's robot is simulated from the export. It does the six steps first, and its values
+are the expected ones. If a value differs by more than is allowed, the joints are damped and the walk ends.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ HANGING, JOINTS, STANDING, STOPPING, SPOT, METRE = STEPS = (
     "a metre",
 )
 STOP = "the emergency stop"  # what a person presses, beside START and WALK
-CALM, LOOK = 2.0, 1.0  # [s] ours: to come to rest; over which a value is taken
-TURN, AHEAD = 0.5, 0.5  # [rad/s], [m/s] ours: commands, or the most that was trained
+CALM, LOOK = 2.0, 1.0  # [s] ours: time to come to rest; time over which a value is averaged
+TURN, AHEAD = 0.5, 0.5  # [rad/s], [m/s] ours: commands, or the largest trained ones
 COUNT = 10  # steps of each foot, on average
-PATIENCE, LONGEST = 2.0, 15.0  # ours: a walk is given up after so many of the exam's times; the exam's own after [s]
-# Allowed differences, ours: a right simulated robot that has a delay of 10 ms, noise and 0.9 of its gains stays within
-# them (docs/first_walk.md)
+PATIENCE, LONGEST = 2.0, 15.0  # ours: longest walk, in times of the exam's robot; its own longest walk [s]
+# Allowed differences, ours: a simulated robot with a delay of 10 ms, noise and 0.9 of its gains stays within them
+# (docs/first_walk.md)
 TILT, BEYOND, MOVED, LEFT = 15.0, 0.25, 0.05, 1.5  # [deg], [rad], [rad], [N m] of a robot that is damped
 ASIDE, HEADING, YAW, TIME = 0.25, 20.0, 0.1, 0.3  # [m], [deg], [rad/s], [s]
 CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; of its yaw rate, times and torques
-STANDS, WALKS = 0.1, 0.07  # [share of the motor's torque] of a torque in the stand, while the policy is on
-SHORT = 1.0  # [N m], or SHARE of the torque, that a motor may give less than it is asked for
+STANDS, WALKS = 0.1, 0.07  # [share of the motor's torque] of a torque in the stand; while the policy runs
+SHORT = 1.0  # [N m] a motor may give this much less than it is asked for, or SHARE of the torque
 
 
 class Value(NamedTuple):
-    """A value of one step; of a value by joint that of the joint which differs most."""
+    """A value of one step. If each joint has one, it is that of the joint which differs most."""
 
     step: str
     name: str
@@ -101,7 +101,7 @@ class _Walked:
 
 
 class FirstWalk(JointCheck):
-    """The list of one robot. ``values`` has each value, ``found`` those by joint."""
+    """The first walk of one robot. ``values``: all compared values. ``found``: all measured ones, an array by step and name."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class FirstWalk(JointCheck):
     ) -> None:
         """``exam``: ``found`` of the exam's robot, from ``rehearse``; None: this is the exam's robot.
 
-        Raises UserError if the policy follows no velocity, RobotError as JointCheck does, ContractError without feet.
+        Raises UserError if the policy has no velocity commands, RobotError as JointCheck does, ContractError without feet.
         """
         super().__init__(controller, sources, say, robot, limits)
         contract = controller.contract
@@ -133,7 +133,7 @@ class FirstWalk(JointCheck):
 
     @property
     def right(self) -> bool:
-        """True if the whole list was done and no value differs."""
+        """True if all steps are done and no value differs."""
         return self.at == METRE and not self.wants and all(value.right for value in self.values)
 
     def listen(self, health: Health, now: float) -> Trip | None:
@@ -183,7 +183,7 @@ class FirstWalk(JointCheck):
         yield from self._a_metre(measured)
 
     def _hangs(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """It hangs at zero torque, nearly level, and no angle is one that its joint cannot have."""
+        """The robot hangs at zero torque, nearly level, and each joint angle is within its range."""
         while self._now < CALM:
             measured = yield Order(ZERO)
         self._want(START, f"{START}: joint check, if it hangs with its feet in the air")
@@ -197,7 +197,7 @@ class FirstWalk(JointCheck):
         return measured
 
     def _joints(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """The joint check; its own verdicts end the list too."""
+        """The joint check. A verdict of its own also ends the walk."""
         self.at = JOINTS
         self._want("", f"each joint moves a little; {END} if another one moves than the one that is named", CHECK)
         yield from self._check(measured)
@@ -229,7 +229,7 @@ class FirstWalk(JointCheck):
         return measured
 
     def _stands(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """What the legs carry by their torques, and each motor's torque."""
+        """Compare the weight that the leg torques carry, and the torque of each motor."""
         carried, torques, asked = [], [], []
         for _ in range(self._periods(LOOK)):
             order = self._stand(measured, self._now)
@@ -245,7 +245,7 @@ class FirstWalk(JointCheck):
         return measured
 
     def _stops(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """The emergency stop, by the one who will hold it, leaves no torque."""
+        """The person who will hold the emergency stop presses it: no torque may remain."""
         self.at = STOPPING
         self._want(STOP, f"now press {STOP}")
         while self.state == STAND:
@@ -314,7 +314,7 @@ class FirstWalk(JointCheck):
     def _walk(
         self, measured: Measurement, command: Floats, done: Callable[[], bool], timed: str = ""
     ) -> Generator[Order, Measurement, Measurement]:
-        """Let the policy follow ``command`` until it is ``done``. ``timed``: the value that its duration is."""
+        """Let the policy follow ``command`` until it is ``done``. ``timed``: the name of its duration as a value."""
         self._asked, self._walked = command, _Walked([], [], [], [], [], [])
         exam = None if self._exam is None or not timed else self._exam[self.at, timed]
         longest = LONGEST if exam is None else PATIENCE * float(exam[0])
@@ -371,9 +371,9 @@ class FirstWalk(JointCheck):
         return np.where(np.isfinite(self._limits.motor), self._limits.motor, 20.0)
 
     def _compare_torque(self, name: str, torques: Sequence[Floats], asked: Sequence[Floats], share: float) -> None:
-        """Compare mean torques (N, D), also with what the servos were asked for: a weak motor gives less.
+        """Compare mean torques (N, D) with the exam's, and with the torques asked of the servos: a weak motor gives less.
 
-        One that reports what it should give shows by its torque, or by the weight that all of them seem to carry.
+        A motor that reports the asked torque instead differs from the exam's torque, or from the carried weight.
         """
         torque = np.mean(torques, axis=0)
         short = np.abs(np.mean(asked, axis=0) - torque)
@@ -381,7 +381,7 @@ class FirstWalk(JointCheck):
         self._compare(name, "N m", torque, share * self._motor_torque, SHARE)
 
     def _compare(self, name: str, unit: str, measured: Any, least: float | Floats, share: float = 0.0) -> None:
-        """Keep a value, or one by joint (D,). Allowed is the ``least`` difference, or a ``share`` of the exam's value."""
+        """Keep a value, or one per joint (D,). Allowed: the larger of ``least`` and ``share`` of the exam's value."""
         measured = np.atleast_1d(measured)
         self.found[self.at, name] = measured
         exam = measured if self._exam is None else self._exam[self.at, name]
@@ -393,7 +393,7 @@ class FirstWalk(JointCheck):
         )
 
     def _judge(self) -> None:
-        """Say the values since the last verdict. Raises Differs if one is not right."""
+        """Print the values since the last call. Raises Differs if one is not right."""
         new, self._judged = self.values[self._judged :], len(self.values)
         if new:
             self._say("\n".join([HEADS, *map(str, new)]))
@@ -402,7 +402,7 @@ class FirstWalk(JointCheck):
 
     @property
     def report(self) -> str:
-        """The end of the list in a line; begins with a newline."""
+        """The outcome in a line, after a newline."""
         if self.right:
             return f"\nfirst walk: all {len(STEPS)} steps done, {len(self.values)} values as the exam's"
         return f"\nfirst walk: it ended at '{self.at}': {self.ended or self.note}"
@@ -417,7 +417,7 @@ def _tilt(measured: Measurement) -> float:
 
 
 class _Willing:
-    """Presses what the list wants."""
+    """An input source that presses the wanted button."""
 
     def __init__(self) -> None:
         self.walk: FirstWalk | None = None
@@ -434,7 +434,7 @@ class _Willing:
 def first_walk(
     robot: Robot, folder: Path, contract: Contract, exam: Mapping[tuple[str, str], Floats] | None = None
 ) -> FirstWalk:
-    """The list, done at once by a simulated ``robot`` that hangs, every button pressed when it is wanted."""
+    """The first walk of a simulated ``robot`` that hangs. Every wanted button is pressed at once."""
     controller, willing = Controller(folder, contract), _Willing()
     limits = Limits.of(folder, contract, robot.limits)
     walk = willing.walk = FirstWalk(controller, [willing], lambda _: None, robot, limits, exam)
@@ -443,7 +443,7 @@ def first_walk(
 
 
 def rehearse(folder: Path, contract: Contract) -> Mapping[tuple[str, str], Floats]:
-    """The values of the exam's robot. Raises UserError if it does not get through the list."""
+    """The values of the exam's robot. Raises UserError if it does not complete all steps."""
     walk = first_walk(MujocoRobot(folder, contract, whole=True, hoisted=True, lift=LIFT), folder, contract)
     if not walk.right:
         raise UserError(f"the exam's robot itself does not do it:{walk.report.replace(chr(10), ' ')}; see --eval first")

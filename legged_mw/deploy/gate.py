@@ -1,6 +1,6 @@
 """legged-mw exam POLICY ...: grade policies over several seeds, and compare with an earlier result of the same exam.
 
-The physics is MuJoCo's C engine and the policy is an export, so neither torch nor a GPU is needed. Exit code 1: a mark fell.
+It runs exports in MuJoCo's C engine, without torch and without a GPU. Exit code 1: a mark fell.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import typed, writable
 from legged_mw.utils.machine import usable_cores
 
-VERSION = 1  # of the exams: raise it when a figure changes its meaning, so that no two meanings are compared
+VERSION = 1  # of the exams: raise it when the meaning of a figure changes; only equal versions are compared
 SEEDS = 3
-# A mark falls when its mean is worse than the stored one by more than the largest of: SPREAD times the range of the stored
-# repeats, the range of the new ones, SHARE of the stored mean, LEAST of the mark. Of 110 comparisons each of go2_flat and
-# g1_flat with themselves, three repeats a side, 3 and 1 were false alarms.
+# A mark falls when its mean is worse than the stored mean by more than the tolerance. The tolerance is the largest of:
+# SPREAD times the range of the stored repeats, the range of the new repeats, SHARE of the stored mean, LEAST of the mark.
+# go2_flat and g1_flat, compared with themselves 110 times with three repeats a side, gave 3 and 1 false alarms.
 SPREAD, SHARE, LEAST = 2.0, 0.1, 0.02
 FELL = 1  # exit code
 
@@ -95,7 +95,7 @@ def main(export: Export) -> None:
 
 
 def find_export(name: str, checkpoint: int = -1) -> Path | None:
-    """The export called ``name``: its folder, that of a run that exported itself, or one that ships. None: a run has none."""
+    """The folder of the export ``name``: an export, a run's own, or one that ships. None: the run has no export yet."""
     folder = typed(name)
     if checkpoint == -1:
         for path in (folder, folder / "export"):
@@ -120,7 +120,7 @@ def _exported(export: Export, name: str, checkpoint: int, folder: Path) -> Path:
 
 
 def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """What an export will be asked, and of which robot: two results are compared only if all of it is equal."""
+    """The exam and the robot of a result. Two results are compared only if all of it is equal."""
     contract = read_contract(folder, args.edited)
     section = dict(contract.exam or {})
     if "kind" in section:
@@ -136,7 +136,7 @@ def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def check_alike(asked: Mapping[str, Any], other: Mapping[str, Any], name: str, against: str) -> None:
-    """Raise UserError if two results are not of one exam and one robot."""
+    """Raise UserError if two results differ in their exam or their robot."""
     for place in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "scene", "hard", "rules"))):
         mine, theirs = (said[place[0]].get(place[1]) for said in (asked, other))
         if mine != theirs:
@@ -163,7 +163,7 @@ class Repeat(NamedTuple):
 
 
 def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
-    """Grade all exports with all seeds. The result is for JSON."""
+    """Grade all exports with all seeds. Returns the result as plain values for JSON."""
     repeats, seeds = [], range(args.seed, args.seed + args.seeds)
     for name, folder in zip(args.policies, folders, strict=True):
         for seed in seeds:
@@ -188,7 +188,7 @@ def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Na
 
 
 def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Namespace) -> Repeat:
-    """One repeat."""
+    """Grade an export once, with one seed."""
     if exam["kind"] != "walking":
         skill = contract_skill(read_contract(folder, args.edited))
         result = run_skill(folder, skill, edited=args.edited, seed=seed)
@@ -218,7 +218,7 @@ def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
 
 
 def named(figures: Sequence[Figure]) -> list[Figure]:
-    """The figures with a mark. An indented row of a table gets the name of the row above it too, so that names are unique."""
+    """The figures with a mark. An indented row also gets the name of the row above, so that names are unique."""
     found, above = [], ""
     for figure in figures:
         above = above if figure.name.startswith(" ") else figure.name
@@ -228,7 +228,7 @@ def named(figures: Sequence[Figure]) -> list[Figure]:
 
 
 def marks_of(repeats: Sequence[Sequence[Figure]]) -> list[dict[str, Any]]:
-    """Each mark with the mean, the worst and all values of the repeats, and the tolerance that follows from them."""
+    """Each mark with its values in all repeats, their mean, the worst of them, and its tolerance."""
     marks = []
     for name, figure in {figure.name: figure for each in repeats for figure in each}.items():
         values = [each.value for figures in repeats for each in figures if each.name == name]
@@ -282,7 +282,7 @@ def _version(package: str) -> str:
 
 
 def read_result(file: Path) -> dict[str, Any]:
-    """A result that ``--json`` wrote. Raises UserError for another file, or half of one."""
+    """Read a result that ``--json`` wrote. Raises UserError if the file is another one or incomplete."""
     advice = "name a file that legged-mw exam POLICY --json FILE wrote"
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
@@ -321,7 +321,7 @@ def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
 
 
 def table(result: Mapping[str, Any], before: Mapping[str, Any] | None) -> str:
-    """The marks as text, beside those of ``before``."""
+    """The marks as text, with those of ``before`` in a column of their own."""
     heads = ["mean", "worst", "mark", "passes", *(["was", "tolerance"] if before else ["tolerance"])]
     old = {each["name"]: each for each in before["marks"]} if before else {}
     lines = [
@@ -350,7 +350,7 @@ LETTER, PAD, HEIGHT = 7.0, 8.0, 20  # [px]
 
 
 def badge(result: Mapping[str, Any]) -> str:
-    """An SVG: the task, and the last verdict that holds in all repeats."""
+    """An SVG with the task and the last verdict that is true in all repeats."""
     held = [word for word, repeats in result["verdicts"].items() if all(repeats)]
     word = (
         held[-1] if held else {"walks": "does not walk"}.get(first := next(iter(result["verdicts"])), f"not: {first}")

@@ -1,6 +1,6 @@
-"""Limits between a policy and a robot: every step is checked, and a passed limit is one line of text.
+"""Limits between a policy and a robot. Every step is checked. A limit that is passed becomes one line of text.
 
-The caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
+The caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or depends on the robot's type.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from legged_mw.utils.errors import UserError, unknown
 
 TORQUE = "torque"  # origin of an action: its targets are torques
 OFF = math.inf  # a limit that is switched off
-# Values that no joint and no gyro can measure; NaN and infinity are beyond them, too.
-# Ours: wheels turn far, and gyros end at 35 rad/s.
+# Values that no joint and no gyro can measure. NaN and infinity are beyond them, too.
+# Ours: a wheel may turn many times; gyros saturate at 35 rad/s.
 _ABSURD = {"joint_pos": (1e5, "rad"), "joint_vel": (1e4, "rad/s"), "ang_vel": (1e3, "rad/s")}
 # A sensor is frozen if its value stays the same, to the last bit, while another sensor shows motion.
 # Both are compared over _ALONE * Limits.frozen measurements. The thresholds of motion below are ours: the smallest step
 # of an encoder or a gyro is a hundredth of them, and a standing robot moves less.
-_ALONE = 3.0  # 0.24 s at 50 Hz: one coarse sensor may repeat its value for a while, the whole measurement may not
+_ALONE = 3.0  # 0.24 s at 50 Hz: a coarse sensor may repeat its value for that long, the whole measurement may not
 _MOVED = 0.05  # [rad] moved: a joint by its speed, the body by gyro or gravity, a target while the body moves
 _SWUNG = 0.1  # [rad] moved by a joint: gyro and gravity must change
 _ASKED = 0.2  # [rad] moved by a joint's target: its encoder must change
@@ -145,7 +145,7 @@ def limits_of(model: Any, contract: Contract) -> Limits:
 
 
 class _Seen(NamedTuple):
-    """The motion in one measurement, and the servos' target before it. Several measurements: (N, ...) each."""
+    """One measurement's signals of motion, and the servos' target before it. Of N measurements each is (N, ...)."""
 
     joint_pos: Floats
     joint_vel: Floats
@@ -225,7 +225,7 @@ class Safety:
         self._last, self._held = np.array(targets), self.held(targets)
         return trip
 
-    # ---- each limit. A comparison is such that NaN is beyond the limit.
+    # ---- each limit. Comparisons are written so that NaN is beyond the limit.
 
     def _finite(self, measured: Measurement) -> Trip | None:
         for name in ("joint_pos", "joint_vel", "gravity", "ang_vel"):
@@ -312,7 +312,7 @@ class Safety:
         )
 
     def _tilt(self, measured: Measurement) -> Trip | None:
-        """The robot's own limit. The task's rule of a fall is ``Ends.tilted``, which counts under the policy alone."""
+        """Trip if the body tilts beyond the robot's limit. The task's rule of a fall, ``Ends.tilted``, holds under the policy only."""
         tilt = math.degrees(math.acos(np.clip(-measured.gravity[2], -1.0, 1.0)))
         return (
             None

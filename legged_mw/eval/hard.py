@@ -313,7 +313,7 @@ def misses(result: Mapping[str, Any]) -> list[str]:
     """What keeps the policy from a robot, in words; empty if it is ready."""
     conditions, found = result["conditions"], result["looks"]
     said = [] if result["walks"] else ["does not walk by the walking exam"]
-    fallen = [name for name, each in conditions.items() if each["falls"]]
+    fallen = ["nominal conditions" if name == "none" else name for name, each in conditions.items() if each["falls"]]
     said += [f"falls under {', '.join(fallen)}"] if fallen else []
     survived = conditions[ALL]["pushes"]
     said += [f"survives {survived:.0%} of the pushes under all, not {PUSHES:.0%}"] if survived < PUSHES else []

@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML page, with JSON and pictures beside it, from results and figures."""
+"""Write the report from results and figures: one self-contained HTML page, JSON, pictures."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def walking_page(
 
 
 def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]) -> str:
-    """The frame of a page. ``body`` begins inside of the header, below the task's name, and closes it."""
+    """The whole HTML document. ``body`` begins inside the header, below the task's name, and must close the header."""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: {escape(exam)}</title><style>{CSS}</style></head>
@@ -121,7 +121,7 @@ def _hard(column: Column) -> str:
 
 
 def _heats(columns: Sequence[Column]) -> str:
-    """The chapters of heat and power: verdict, one line each, a row a motor."""
+    """The chapter of heat and power for each column: the verdict, a line per finding, a row per motor."""
     chapters = []
     for result in (column.exam["heat"] for column in columns if "heat" in column.exam):
         *said, _ = (f"<li>{escape(line)}</li>" for line in heat.lines(result))
@@ -134,7 +134,7 @@ def _heats(columns: Sequence[Column]) -> str:
 
 
 def _names(columns: Sequence[Column], rules: ExamRules) -> str:
-    """The graded policies in the colours of their curves, with pass or fail."""
+    """The list of graded policies with their verdicts, in the colours of their curves."""
     items, drawn = [], [column.name for column in columns if column.figures]
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
@@ -302,7 +302,7 @@ def _joint_rows(column: Column, whose: str) -> list[list[str]]:
 
 
 def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
-    """A table. With the title ``folded`` the reader unfolds it."""
+    """A table. With a title ``folded`` it starts folded below that title."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
         f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows

@@ -180,7 +180,7 @@ OVERRIDES: dict[str, Any] = {
     "termination.max_tilt": 90.0,  # [deg]; only a larger tilt is a fall
     "termination.min_base_height": 0.0,
 }
-# Config fields that the user may not override. Domain randomization may be: it exams other than the nominal robot.
+# Config fields that the user may not override. Domain randomization is none of them: it lets a user grade other robots.
 SETS = {*OVERRIDES, "env.num_envs"} - {"domain_rand.enable"}
 
 SIGNALS: dict[str, Signal] = {
@@ -273,7 +273,7 @@ def make_plan(cfg: LeggedRobotCfg, dt: float) -> Plan:
 
 
 def _stepping(axis: int, limits: list[float], dt: float) -> list[Case]:
-    """Step the command along one axis: walk, reverse, stand, walk again. Each world starts a little later."""
+    """Cases whose command steps along one axis: walk, reverse, stand, walk again. Each world starts a little later."""
     stand: Velocity = (0.0, 0.0, 0.0)
     low, high = ((*stand[:axis], round(STEP_SHARE * limit, 2), *stand[axis + 1 :]) for limit in limits)
     begins = [round((STEP_BEGINS + i * STEP_SHIFT) / dt) for i in range(STEP_REPEATS)]
@@ -310,7 +310,7 @@ def make_room(task: LoadedTask) -> None:
 
 
 def ask_alike(tasks: Sequence[LoadedTask]) -> None:
-    """Grade all prepared tasks by the rules of the first, also those with other trained ranges."""
+    """Give all prepared tasks the exam rules of the first, whatever ranges they were trained in."""
     first, *others = (ExamRules.from_config(task.cfg) for task in tasks)
     for task, own in zip(tasks[1:], others, strict=True):
         if own != first:
@@ -386,7 +386,7 @@ TRAINING_PUSH_AT = 1.0  # [s] time of the first of 16 pushes; a push is survived
 
 
 def copy_of(task: LoadedTask) -> LoadedTask:
-    """The task as it is trained, with its overrides, to be turned into an exam."""
+    """A copy of the task with its overrides, which may be turned into an exam."""
     copy = load_task(str(task.path))
     copy.update(task.to_dict(), where="training")
     copy.exam = task.exam

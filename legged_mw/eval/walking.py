@@ -29,9 +29,9 @@ GRAVITY = 9.81  # [m/s^2]
 LEVELS = 10  # of each kind of rough terrain
 SLOW = 0.1  # [m/s] slowest speed with a meaningful cost of transport
 EQUAL_DRIFT = 0.005  # [m] smaller drifts count as equal
-# Defaults: push speeds [m/s], the speed that must be survived [m/s], the measure of the marks, fixed marks
-# [m/s, m/s, rad/s]. A biped sways at each step. Its error at each time contains the sway,
-# so its marks are of the offset.
+# Defaults: push speeds [m/s], the push speed that must be survived [m/s], what the marks measure, fixed marks
+# [m/s, m/s, rad/s]. A biped sways at each step, and its error at each time contains the sway. So its marks are of the
+# offset.
 BIPED: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0), "push_mark": 1.0, "marks_of": "offset"}
 OTHERS: dict[str, Any] = {
     "push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0),
@@ -61,9 +61,9 @@ class Peer(NamedTuple):
 
 
 def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, float]]:
-    """By robot, from ``resources/peers.yaml``: its published policies, their common command range, their load [kg].
+    """Three tables by robot from ``resources/peers.yaml``: published policies, their common command ranges, their load [kg].
 
-    A policy that was measured in its trained ranges and in the common range is listed twice.
+    A policy that was measured both in its trained ranges and in the common range is listed twice.
     """
     peers: dict[str, list[Peer]] = {}
     common: dict[str, Ranges] = {}
@@ -206,7 +206,7 @@ class ExamRules:
         return f"asked: {', '.join(spans)}{common}"
 
     def peer_words(self) -> str:
-        """The peers as text, with the figures that were measured in another way; empty without peers."""
+        """The peers as text. Says which of their figures were measured differently. Empty without peers."""
         if not self.peers:
             return ""
         first = self.peers[0]
@@ -292,10 +292,10 @@ class ExamRules:
         return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
     def advise(self, errors: Sequence[float], falls: float, survived: float) -> list[str]:
-        """What a policy can do, what it cannot, and what to try next, a line each, from the exam during training.
+        """Three lines from the exam during training: what the policy can do, what it cannot, what to try next.
 
-        ``errors`` of vx, vy [m/s] and yaw rate [rad/s] are those of each step, sway included: a robot that is graded by
-        the mean velocity may be off by twice the mark. ``falls``: of 22; ``survived``: the share of the pushes.
+        ``errors`` of vx, vy [m/s] and yaw rate [rad/s] are those of each step and contain the sway. So a robot whose
+        marks are of the offset may be off by twice the mark. ``falls``: of 22; ``survived``: the share of the pushes.
         """
         most = [mark * (2.0 if self.marks_of == "offset" else 1.0) for mark in self.marks]
         able = {"stand at all 22 commands": not falls, f"survive pushes of {self.push_mark:g} m/s": survived == 1.0}
@@ -324,7 +324,7 @@ class ExamRules:
         return sum(figure.reaches_peer() for figure in compared), len(compared)
 
     def figures(self, result: Mapping[str, Any], others: Sequence[Mapping[str, Any]] = ()) -> list[Figure]:
-        """The figures of the result in the order of the table, with a row for each figure that only ``others`` have."""
+        """The figures of the result in the table's order, with a row for each figure that only ``others`` have."""
         peer, unknown_of_peer = best_of(self.peers), (None, None, None)
         apart = "*" if any(peer.own_speed for peer in self.peers) else ""
         listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
