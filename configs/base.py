@@ -195,10 +195,16 @@ class UprightBipedCfg(BipedCfg):
             pose = 1.0  # [M]
             feet_phase = 3.0  # with 1.0 the feet chatter: 2 to 5 steps/s where the clock says 1.25
             contact_phase = 1.0  # with it an H1 keeps the clock, and lifts its feet by 57 mm instead of 10 to 30
+            feet_impact_vel = -0.25  # no stamping
+            feet_orientation = -1.0  # soles level
+            dof_acc = -2e-7  # no jerks
+            action_rate = -0.02
+            energy = -0.001  # of a G1; less for a heavier robot
             termination = -200.0  # [M, I]
 
     class domain_rand(BipedCfg.domain_rand):
-        friction, stiffness, damping = [0.3, 1.2], [0.8, 1.2], [0.8, 1.2]  # [-]
+        friction, stiffness, damping = [0.3, 1.2], [0.75, 1.25], [0.75, 1.25]  # [-]
+        base_mass, delay_ms = [-1.0, 5.0], [0.0, 20.0]  # [kg] of a G1, [ms]
 
     class perturbation(BipedCfg.perturbation):
         velocity, interval = [0.0, 6.0], [4.0, 8.0]  # [m/s], [s] kicks to 8 m/s each 1 to 3 s teach it to stand still

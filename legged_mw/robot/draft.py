@@ -51,12 +51,12 @@ LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 # of the solver under implicitfast [ours: with 10 both engines agree to 1e-5 rad/s, with 3 a T1 is off by 7 rad/s a step]
 IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 20}
-# reward terms for how a walk looks: joints without jerks, feet that are put down softly, arms and waist near the pose,
-# soles level [ours, of legged_gym's, walk-these-ways' and Playground's terms]
+# reward terms for how a quadruped's walk looks: joints without jerks, feet that are put down softly; UprightBipedCfg has
+# a biped's [ours, of legged_gym's, walk-these-ways' and Playground's terms]
 LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25, "target_limits": -1.0}
 # of `energy`, per kilogram: -0.001 of a G1 of 35 kg (docs/archive/go2_and_g1.md), Playground's -0.001 of a Go1 of 13 kg
 ENERGY = {2: -0.035, 4: -0.013}
-LOOKS_OF_A_BIPED = {**LOOKS, "dof_acc": -2e-7, "action_rate": -0.02, "feet_orientation": -1.0}
+SLIPPERY = [0.25, 1.2]  # friction of a quadruped's ground [-] [ours: an ANYmal C that knew 0.4 and more fell at 0.3]
 # [s], [m/s] each axis, [rad/s] likewise [go2_rl_gym: 4, 0.4, 0.6]
 PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 0.5, "max_push_ang_vel": 0.6}
 BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # of a biped that follows a gait clock
@@ -278,7 +278,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
     rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
-    return {**chosen, "domain_rand": _worlds(found, (-0.07, 0.2)), "perturbation": dict(PUSHES), "rewards": rewards}
+    worlds = {"friction": SLIPPERY, **_worlds(found, (-0.07, 0.2))}
+    return {**chosen, "domain_rand": worlds, "perturbation": dict(PUSHES), "rewards": rewards}
 
 
 def _energy(found: Draft) -> dict[str, float]:
@@ -313,7 +314,7 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
         **low,
         "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
         "pose_weights": table(pose_weights(robot, found.pose, found.feet, weights), robot.joint_names),
-        "scales": dict(BY_CLOCK) if found.simple else {**LOOKS_OF_A_BIPED, **_energy(found)},
+        "scales": dict(BY_CLOCK) if found.simple else _energy(found),
     }
     worlds = _worlds(found, (-0.03, 0.2))
     if not found.simple:

@@ -60,6 +60,7 @@ _COMMENTS = {
     "ang_vel_yaw": "[rad/s]",
     "min_base_height": "[m] half of the standing height: lower, it fell",
     "swing_height": "[m] of a swinging foot",
+    "friction": "[-] of the ground",
     "kick": "without kicks a push topples it [ours: docs/lab.md]",
     "velocity": "[m/s]",
     "leave_out": "the policy is told its velocity; for a real robot leave this out",
