@@ -617,6 +617,14 @@ def test_a_panel_offers_what_its_pilot_can_and_no_more() -> None:
     assert page.moment and window_texts(page.moment._replace(help=True), pilot.bindings)[1][2] == "r backspace\nc"
 
 
+def test_the_panel_is_folded_once_when_the_screen_is_narrow() -> None:
+    page, ui, _, _ = panel()
+    for ui.width, folded in ((1280.0, False), (390.0, True), (390.0, False), (0.0, False)):
+        ui.folded = False
+        page.build()
+        assert ui.folded == folded
+
+
 def test_one_robot_has_no_next_one_and_speed_goes_round() -> None:
     page, ui, _, pilot = panel(1)
     ui.clicked = {"slower"}
