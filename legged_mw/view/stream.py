@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import io
 import json
+import os
+import sys
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -45,7 +47,7 @@ class Stream:
 
     def __init__(self, spec: mujoco.MjSpec, panel: Panel, count: int) -> None:
         self._spec, self._panel, self._count = spec, panel, count
-        self._artist = ThreadPoolExecutor(1, "artist")  # an OpenGL context belongs to one thread
+        self._artist = ThreadPoolExecutor(1, "artist", _step_back)  # an OpenGL context belongs to one thread
         self._renderer: RobotRenderer | None = None  # made for the first page that asks
         self._picture, self._drawn = b"", 0.0  # the last JPEG, its time [s]
         self._moves: deque[tuple[int, float, float]] = deque(maxlen=100)  # of the camera, for the next picture
@@ -84,7 +86,7 @@ class Stream:
 
     async def _serve(self, socket: Any, session: str) -> None:
         """Answer one page until it leaves or asks for what there is not."""
-        asked, sender = asyncio.Event(), None
+        asked, sender = asyncio.Semaphore(0), None
         try:
             async for message in socket:
                 if message != NEXT:
@@ -96,7 +98,7 @@ class Stream:
                 elif sender is None:
                     self._watching.append(socket)
                     sender = asyncio.create_task(self._send(socket, asked))
-                asked.set()
+                asked.release()
         finally:
             if sender is not None:
                 self._watching.remove(socket)
@@ -106,19 +108,17 @@ class Stream:
         """Whether this page drives. Of Studio's pages it is the one that Studio has accepted."""
         return session == self._studio[0] if self._studio else socket in self._watching[:1]
 
-    async def _send(self, socket: Any, asked: asyncio.Event) -> None:
-        """Send the panel's numbers and a picture each time when `asked` is set."""
+    async def _send(self, socket: Any, asked: asyncio.Semaphore) -> None:
+        """Send the panel's numbers and a picture for each request that `asked` counts."""
         from websockets.exceptions import ConnectionClosed
 
         loop, due = asyncio.get_running_loop(), 0.0
         with suppress(ConnectionClosed):
             while True:
-                await asked.wait()
+                await asked.acquire()
                 await asyncio.sleep(max(0.0, due - loop.time()))
-                if self._panel.moment is None:  # the session has not begun
-                    due = loop.time() + 1.0 / FPS
-                    continue
-                asked.clear()
+                while self._panel.moment is None:  # the session has not begun
+                    await asyncio.sleep(1.0 / FPS)
                 due = max(due + 1.0 / FPS, loop.time())
                 try:
                     picture = await loop.run_in_executor(self._artist, self._draw)
@@ -171,6 +171,12 @@ class Stream:
         if drives:
             act()
         return True
+
+
+def _step_back() -> None:
+    """Lower the priority of this thread and of those that OpenGL starts from it: the control loop comes first."""
+    if sys.platform == "linux":  # elsewhere it would be the whole process's
+        os.nice(5)
 
 
 def _request(message: str | bytes) -> list[str | float] | None:
