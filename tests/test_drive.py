@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -456,23 +458,22 @@ def test_the_tunnel_line_names_the_machine_as_its_user_knows_it(monkeypatch: pyt
 
 
 class FakeUi:
-    """ImGui as far as a panel goes: `clicked` buttons, `dragged` sliders and `pressed` keys; blocks must be closed."""
+    """ImGui as far as a panel goes: `clicked` buttons and `dragged` sliders; blocks must be closed."""
 
     def __init__(self) -> None:
         self.clicked: set[str] = set()
         self.dragged: dict[str, float] = {}
-        self.pressed: set[str] = set()
         self.typing, self.depth, self.seen = False, 0, []
+        self.width, self.folded = 1280.0, False
         self.ranges: dict[str, tuple[float, float]] = {}
         self.WindowFlags = SimpleNamespace(NoFocusOnAppearing=1)
         self.Cond = SimpleNamespace(FirstUseEver=4)
-        self.Key = SimpleNamespace(**{name: name for name in KEY_NAMES.values()})
 
     def GetIO(self) -> Any:
-        return SimpleNamespace(WantCaptureKeyboard=self.typing)
+        return SimpleNamespace(WantCaptureKeyboard=self.typing, DisplaySize=SimpleNamespace(x=self.width))
 
-    def IsKeyPressed(self, key: str, repeat: bool) -> bool:
-        return key in self.pressed
+    def SetNextWindowCollapsed(self, folded: bool) -> None:
+        self.folded = folded
 
     def Begin(self, title: str, *_: Any) -> tuple[bool, bool]:
         self.depth += 1
@@ -590,29 +591,38 @@ def test_a_panel_has_a_slider_and_a_curve_for_each_command_of_the_table() -> Non
 
 
 def test_keys_of_the_page_are_those_of_the_window_unless_somebody_types() -> None:
+    assert set(KEY_NAMES.values()) < set(KEY_ACTION)
     page, ui, _, pilot = panel()
-    ui.pressed = {"UpArrow", "N"}
-    ui.typing = True
-    page.build()
-    pilot.listen()
-    assert not pilot.driving and pilot.world == 0
-    ui.typing = False
-    page.build()
-    pilot.listen()
-    assert pilot.driving and pilot.world == 1
+    for ui.typing, studio, world in ((True, True, 0), (True, False, 1), (False, True, 0)):
+        page.build()
+        for key in ("ArrowUp", "N", "Unidentified"):
+            page.press(key, studio)
+        pilot.listen()
+        assert pilot.world == world and pilot.driving == (not (ui.typing and studio))
 
 
 def test_a_panel_offers_what_its_pilot_can_and_no_more() -> None:
     """As of a real robot: in other words, without sliders, and other keys do nothing."""
     page, ui, _, _ = panel(1)
     page.pilot = pilot = Pilot(THREE, 1, only={"reset": "Damp", "camera": ""})
-    ui.clicked, ui.pressed = {"reset"}, {"UpArrow", "P", "Enter"}
+    ui.clicked = {"reset"}
     page.build()
+    for key in ("ArrowUp", "P", "Enter"):
+        page.press(key, studio=True)
+    page.steer(0, 1.0)
     pilot.listen()
     assert [text for text in ui.seen if "###" in text] == ["Damp###reset", "View: follow###camera"] and not ui.ranges
     assert pilot.take_resets() == [0] and not (pilot.driving or pilot.paused or pilot.take_pushes())
     assert "Damp" in ui.seen and "slow motion" not in ui.seen and ui.depth == 0
     assert page.moment and window_texts(page.moment._replace(help=True), pilot.bindings)[1][2] == "r backspace\nc"
+
+
+def test_the_panel_is_folded_once_when_the_screen_is_narrow() -> None:
+    page, ui, _, _ = panel()
+    for ui.width, folded in ((1280.0, False), (390.0, True), (390.0, False), (0.0, False)):
+        ui.folded = False
+        page.build()
+        assert ui.folded == folded
 
 
 def test_one_robot_has_no_next_one_and_speed_goes_round() -> None:
@@ -686,6 +696,54 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
     with pytest.raises(ViewError, match="--host"):  # which a socket takes for every interface
         WebViewer(SPEC, pilot, host="")
     assert not hasattr(web_viewer, "print"), "Studio's own words are its own again"
+
+
+# Studio's program as far as our script sees it, 3 frames a second: it has its model and drives
+SLOW = """currentModelCrc = 1; Module.session_id = "7"; new WebSocket(origin.replace("http", "ws") + "/ui?sid=7");
+(function frame() { const end = performance.now() + 300; while (performance.now() < end); requestAnimationFrame(frame); })()"""
+
+
+@pytest.mark.browser
+def test_a_slow_browser_gets_pictures_and_no_short_key_is_lost() -> None:
+    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
+
+    from legged_mw.view.web import WebViewer
+
+    def pressed(tab: Any) -> int:
+        for _ in range(3):
+            tab.keyboard.press("p")
+        pushes, until = 0, time.monotonic() + 20
+        while pushes < 3 and time.monotonic() < until:
+            tab.wait_for_timeout(100)
+            pilot.listen()
+            pushes += len(pilot.take_pushes())
+        return pushes
+
+    wrong, now = list[str](), np.zeros((1, 3))
+    moment = Moment(0.0, np.array([[0, 0, 1.0, 1, 0, 0, 0]]), now, now, now, np.ones((1, 0), dtype=bool))
+    with closing(WebViewer(SPEC, pilot := Pilot(THREE), 1)) as page, sync_playwright() as play:
+        page.show(moment)
+        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": 390, "height": 800})
+        tab.on("pageerror", lambda error: wrong.append(str(error)))
+        tab.route("**/web_client.js", lambda route: route.fulfill(body=SLOW, content_type="text/javascript"))
+        tab.goto(f"{page.url}#browser")
+        tab.wait_for_function("shown.length > 3")
+        assert pressed(tab) == 3 and tab.url.endswith("#browser")  # as asked, however slow
+        tab.goto(f"{page.url}?")
+        tab.wait_for_url("**/drawn#*")
+        tab.wait_for_function("times.length > 1")
+        assert pressed(tab) == 3 and "drawn by the server" in tab.inner_text("#how")
+        assert tab.evaluate("document.documentElement.scrollWidth") == 390 and not tab.is_visible("#buttons")
+        tab.click("#title")
+        assert tab.is_visible("#buttons") and pilot.command[0] == 0.0
+        tab.locator("#sliders input").first.fill("0.5")
+        tab.get_by_text("Stop", exact=True).wait_for()
+        tab.wait_for_timeout(200)
+        pilot.listen()
+        assert pilot.driving and pilot.command.tolist() == [0.5, 0, 0]
+        browser.close()
+    assert wrong == []
 
 
 # ---- the environment as a stage

@@ -1,7 +1,8 @@
-"""The web page's panel in Dear ImGui: numbers, sliders, buttons, keys and curves, for one pilot.
+"""The web page's panel for one pilot: numbers, sliders, buttons, keys and curves in Dear ImGui, or all but curves as data.
 
 The viewer's thread builds the panel for every picture from the last moment and the pilot. ImGui ends the process if an
-exception leaves a block open, so all code that can fail runs before a block is opened.
+exception leaves a block open, so all code that can fail runs before a block is opened. Keys do not come through ImGui,
+which sees them once a picture: the page sends each as it is pressed.
 """
 
 from __future__ import annotations
@@ -11,17 +12,17 @@ from typing import Any
 import numpy as np
 
 from legged_mw.utils.commands import with_units
-from legged_mw.view.drive import KEY_ACTION, NO_COMMANDS, PUSH_MAX, SPEEDS, Pilot
+from legged_mw.view.drive import NO_COMMANDS, PUSH_MAX, SPEEDS, Pilot
 from legged_mw.view.overlay import COMMAND_RGBA, VELOCITY_RGBA
 from legged_mw.view.stage import FloatArray, Moment, velocity_columns
 
 CURVE_SECONDS, CURVE_POINTS = 10.0, 100
 WIDTH, COLUMN = 330, 90  # [px] width of the panel, start of its second column
-_KEYS = {  # ours -> ImGui's
-    **{"up": "UpArrow", "down": "DownArrow", "left": "LeftArrow", "right": "RightArrow"},
-    **{"space": "Space", "backspace": "Backspace", "enter": "Enter", "-": "Minus", "=": "Equal"},
+NARROW = 600  # [px] on a narrower screen, such as a phone's, the panel is folded at first
+KEY_NAMES = {  # KeyboardEvent.key of a browser -> ours, where it is not the same letter
+    **{"ArrowUp": "up", "ArrowDown": "down", "ArrowLeft": "left", "ArrowRight": "right"},
+    **{" ": "space", "Backspace": "backspace", "Enter": "enter"},
 }
-KEY_NAMES = {key: _KEYS.get(key, key.upper()) for key in KEY_ACTION}
 BUTTONS = (  # rows of (action, label)
     (("stop", "Stop"), ("push", "Push"), ("reset", "Reset")),
     (("pause", "Pause"), ("slower", "Slow"), ("camera", "Camera")),
@@ -53,7 +54,8 @@ class Panel:
     def __init__(self, pilot: Pilot, title: str, ui: Any, plot: Any) -> None:
         self.pilot, self.title, self.ui, self.plot = pilot, title, ui, plot
         self.curves = Curves(len(pilot.table))
-        self._folded = False
+        self._folded = self._narrow = False
+        self._typing = False  # the user types a number into a slider of ImGui
         self.moment: Moment | None = None  # the last one
 
     def show(self, moment: Moment) -> None:
@@ -62,12 +64,14 @@ class Panel:
         self.moment = moment
 
     def build(self) -> None:
-        """Handle the pressed keys and build the panel of one picture."""
+        """Build the panel of one picture."""
         moment = self.moment
         if moment is None:
             return
         ui = self.ui
-        self._keys()
+        self._typing = bool(ui.GetIO().WantCaptureKeyboard)
+        before, self._narrow = self._narrow, 0 < ui.GetIO().DisplaySize.x < NARROW
+        self._folded |= self._narrow and not before
         ui.SetNextWindowPos(ui.Vec2(12, 12), ui.Cond.FirstUseEver)
         ui.SetNextWindowSize(ui.Vec2(WIDTH, 0), ui.Cond.FirstUseEver)
         if self._folded:
@@ -85,13 +89,56 @@ class Panel:
         finally:
             ui.End()
 
-    def _keys(self) -> None:
-        ui = self.ui
-        if ui.GetIO().WantCaptureKeyboard:  # the user types a number into a slider
-            return
-        for key, name in KEY_NAMES.items():
-            if ui.IsKeyPressed(getattr(ui.Key, name), False):
-                self.pilot.press(key)
+    # ---- what a page asks for, on any thread
+
+    def press(self, key: str, studio: bool) -> None:
+        """Do the action of a browser's key. `studio`: it was pressed on Studio's page, where the user may be typing."""
+        if not (studio and self._typing):
+            self.pilot.press(KEY_NAMES.get(key, key.lower()))
+
+    def click(self, action: str) -> None:
+        """Do the action of a button. The speed button cycles through the speeds."""
+        pilot = self.pilot
+        if action == "slower" and pilot.speed == SPEEDS[-1]:
+            for _ in SPEEDS[1:]:
+                pilot.ask("faster")
+        else:
+            pilot.ask(action)
+
+    def steer(self, column: int, value: float) -> None:
+        """Drive by the shown commands with `value` in this column."""
+        if "own" in self.pilot.can and self.moment is not None:
+            command = self._command(self.moment)
+            command[column] = value
+            self.pilot.steer(command)
+
+    def set_push(self, speed: float) -> None:
+        """Set the speed [m/s] of a push."""
+        self.pilot.push_speed = min(max(speed, 0.0), PUSH_MAX)
+
+    def facts(self) -> dict[str, Any]:
+        """The panel as data that JSON can hold, for a page without ImGui."""
+        pilot, moment, sliders = self.pilot, self.moment, []
+        if moment is not None and "own" in pilot.can:
+            values = self._command(moment)
+            sliders = [
+                [with_units([each]), each.low, each.high, float(value)]
+                for each, value in zip(pilot.table, values, strict=True)
+            ]
+        rows = [[[action, self._words(action, label)] for action, label in row] for row in self._rows()]
+        if pilot.num_worlds > 1:
+            rows.append([["everyone", "Drive one robot" if pilot.everyone else "Drive all robots"]])
+        return {
+            "title": self.title,
+            "lines": moment.lines if moment else (),
+            "sliders": sliders,
+            "buttons": rows,
+            "push": [pilot.push_speed, PUSH_MAX] if "push" in pilot.can else None,
+            "keys": [[" ".join(binding.keys), binding.text] for binding in pilot.bindings],
+            "help": pilot.help,
+        }
+
+    # ---- ImGui's
 
     def _numbers(self, moment: Moment) -> None:
         ui = self.ui
@@ -107,7 +154,7 @@ class Panel:
     def _sliders(self, moment: Moment) -> None:
         """Draw a slider for each command. Dragging it drives the robot."""
         ui, pilot = self.ui, self.pilot
-        command = np.array(pilot.command if pilot.driving else moment.commands[moment.world])
+        command = self._command(moment)
         ui.SeparatorText("command")
         if not pilot.table:
             ui.Text(NO_COMMANDS)
@@ -115,33 +162,35 @@ class Panel:
             ui.SetNextItemWidth(0.62 * WIDTH)
             changed, value = ui.SliderFloat(with_units([each]), float(command[index]), each.low, each.high, "%.2f")
             if changed:
-                command[index] = value
-                pilot.steer(command)
+                self.steer(index, value)
+
+    def _command(self, moment: Moment) -> FloatArray:
+        """The command (C,) of the followed robot as a copy: the user's, or the task's own."""
+        return np.array(self.pilot.command if self.pilot.driving else moment.commands[moment.world])
 
     def _buttons(self) -> None:
         ui, pilot = self.ui, self.pilot
         ui.SeparatorText("robot")
-        for row in BUTTONS:
-            several = [
-                (action, label)
-                for action, label in row
-                if action in pilot.can and (action != "next" or pilot.num_worlds > 1)
-            ]
-            for place, (action, label) in enumerate(several):
+        for whole, row in zip(BUTTONS, self._rows(), strict=True):
+            size = ui.Vec2(0.94 * WIDTH / len(whole) - 6, 0)
+            for place, (action, label) in enumerate(row):
                 if place:
                     ui.SameLine()
-                if ui.Button(
-                    self._label(action, label), ui.Vec2(0.94 * WIDTH / 3 - 6 if len(row) == 3 else 0.47 * WIDTH - 6, 0)
-                ):
-                    self._click(action)
+                if ui.Button(f"{self._words(action, label)}###{action}", size):  # ImGui knows it by the part after ###
+                    self.click(action)
         ui.SetNextItemWidth(0.62 * WIDTH)
         if "push" in pilot.can:
             pilot.push_speed = ui.SliderFloat("push [m/s]", pilot.push_speed, 0.0, PUSH_MAX, "%.1f")[1]
         if pilot.num_worlds > 1 and ui.Checkbox("drive all robots", pilot.everyone)[0]:
             pilot.ask("everyone")
 
-    def _label(self, action: str, label: str) -> str:
-        """The text of a button. ImGui identifies the button by the part after ###."""
+    def _rows(self) -> list[list[tuple[str, str]]]:
+        """BUTTONS as far as the pilot can do them."""
+        can = self.pilot.can - (set() if self.pilot.num_worlds > 1 else {"next"})
+        return [[(action, label) for action, label in row if action in can] for row in BUTTONS]
+
+    def _words(self, action: str, label: str) -> str:
+        """The text of a button now."""
         pilot = self.pilot
         words = {
             **pilot.words,
@@ -149,16 +198,7 @@ class Panel:
             "slower": f"Speed x {pilot.speed:g}",
             "camera": f"View: {pilot.camera}",
         }
-        return f"{words.get(action, label)}###{action}"
-
-    def _click(self, action: str) -> None:
-        """Do the action of the button's key. The speed button cycles through the speeds."""
-        pilot = self.pilot
-        if action == "slower" and pilot.speed == SPEEDS[-1]:
-            for _ in SPEEDS[1:]:
-                pilot.ask("faster")
-        else:
-            pilot.ask(action)
+        return words.get(action, label)
 
     def _curves(self) -> None:
         """Draw a plot for each command, with the measured velocity if the command is a velocity."""

@@ -1,4 +1,4 @@
-"""The web page: MuJoCo Studio's web viewer with our panel. This process serves it and loads nothing from the internet.
+"""The web page: MuJoCo Studio's web viewer with our panel, and our page of pictures. It loads nothing from the internet.
 
 The page is not encrypted, so by default it is bound to 127.0.0.1; use `ssh -L` to reach it from another machine.
 `Gate` controls the access. Undocumented parts of Studio are used only in `_bound_to` and `close`, and checked there.
@@ -27,6 +27,7 @@ import mujoco
 from legged_mw.view.drive import Pilot
 from legged_mw.view.posed_robot import PosedRobots
 from legged_mw.view.stage import Moment, ViewError
+from legged_mw.view.stream import ADDED, PAGE, Stream
 
 LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 20
@@ -71,8 +72,9 @@ class WebViewer:
                 f"--viewer web: this process serves {WebViewer._serving} already, and MuJoCo's web viewer can be there once: close it first"
             )
         self._plugin, gate = StudioPlugin(self.robots, pilot, title), Gate(host, port)
+        self._stream = Stream(spec, self._plugin.panel, count)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
-        with _bound_to(host, gate):
+        with _bound_to(host, gate, self._stream):
             self._handle: Any = launch_web.launch(config, plugins=[self._plugin])
             self._wait(host, port)
         self.url, self.port = gate.url(host), port
@@ -97,6 +99,7 @@ class WebViewer:
         try:
             self._handle.close()
         finally:
+            self._stream.close()
             viewer, self._plugin.viewer = self._plugin._viewer, None
             if viewer is not None and not self._handle._is_alive_fn():
                 vars(viewer).pop("_headless_ui", None)  # the last reference: C++ frees its objects once per process
@@ -127,8 +130,8 @@ class WebViewer:
 
 
 @contextmanager
-def _bound_to(host: str, gate: Gate) -> Iterator[None]:
-    """While Studio starts: bind its socket to `host`, for which it has no setting, add `gate`, and reduce its log."""
+def _bound_to(host: str, gate: Gate, stream: Stream) -> Iterator[None]:
+    """While Studio starts: bind its socket to `host`, for which it has no setting, add ours, and reduce its log."""
     from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
@@ -142,7 +145,7 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
     web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # Studio's banner would name all interfaces
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
     web_server.bind_loopback_socket = OwnSocket  # the link from the page's server to the panel, both in this process
-    web_server.serve = lambda handler, **settings: serve(handler, **_guarded(settings, gate))
+    web_server.serve = lambda handler, **settings: serve(stream.around(handler), **_guarded(settings, gate))
     try:
         yield
     finally:
@@ -151,7 +154,7 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
 
 
 def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
-    """The settings of Studio's server, with `gate` before each request and limits on a browser's messages."""
+    """The settings of Studio's server, with `gate` before each request, our pages, and limits on a browser's messages."""
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
@@ -161,12 +164,26 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
         status, reason, extra = 403, gate.refusal(request.path, request.headers.get_all), {}
         if not reason and (extra := gate.greeting(request.path)):
             status, reason = 303, "welcome"
+        path = request.path.partition("?")[0]
+        if not reason and path == "/drawn":
+            html = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(PAGE))}
+            return Response(200, "OK", Headers({**html, "Cache-Control": "no-store"}), PAGE)
+        if not reason and path == "/stream":
+            return None  # go on with the handshake
         if not reason:
-            return answer(connection, request)
+            response = answer(connection, request)
+            whole = path in ("/", "/index.html") and response.status_code == 200
+            return with_ours(response) if whole else response
         body = f"{reason}\n".encode()
         plain = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
         plain |= {"Connection": "close", "Cache-Control": "no-store"}
         return Response(status, "Forbidden" if status == 403 else "See Other", Headers({**plain, **extra}), body)
+
+    def with_ours(page: Any) -> Any:
+        page.body = page.body.replace(b"<body>", b"<body>" + ADDED, 1)
+        del page.headers["Content-Length"]
+        page.headers["Content-Length"] = str(len(page.body))
+        return page
 
     def finish_safely(connection: Any, request: Any, response: Any) -> Any:
         finish(connection, request, response)
@@ -223,7 +240,8 @@ def tunnel_line(port: int) -> str:
 
 # ---- access control: a browser must open the page's own address, with its token if the page has one
 
-SOCKETS = ("/ui", "/state")  # paths of the page's WebSockets in Studio
+SOCKETS = ("/ui", "/state", "/stream")  # paths of the pages' WebSockets
+PAGES = ("/", "/drawn")
 FRAMES = ("iframe", "frame", "embed", "object", "fencedframe")
 MOST = 1 << 20  # [bytes] largest message from a browser; ours: 100 times the input of one second
 PATIENCE = 10.0  # [s] time limit for a browser's request
@@ -294,9 +312,10 @@ class Gate:
 
     def greeting(self, target: str) -> dict[str, str]:
         """Headers for a first visit with the right token: set a cookie, drop the token from the address. Else empty."""
-        if not self.token or target.partition("?")[0] != "/" or not self._shown(self.asked(target)):
+        path = target.partition("?")[0]
+        if not self.token or path not in PAGES or not self._shown(self.asked(target)):
             return {}
-        return {"Location": "/", "Set-Cookie": f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"}
+        return {"Location": path, "Set-Cookie": f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"}
 
     def _shown(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(errors="replace"), self.token.encode())

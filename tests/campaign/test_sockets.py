@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import json
 import math
 import socket
 import time
@@ -27,7 +29,7 @@ from legged_mw.unitree.client import UnitreeRobot
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.serve import SimulatedUnitree
-from legged_mw.view.drive import Pilot
+from legged_mw.view.drive import PUSH_MAX, Pilot
 from legged_mw.view.stage import Moment, ViewError
 from legged_mw.view.web import MOST, Gate, WebViewer, is_local
 from tests.wires import POLICIES, Owner
@@ -50,6 +52,9 @@ REQUESTS = [  # name, path, headers beside Host, refusal
     ("a link of another site", "/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}, ""),
     ("a script of the page", "/web_client.js", {"Sec-Fetch-Site": "same-origin"}, ""),
     ("its socket", "/ui?sid=1", PAGE, ""),
+    ("our own socket", "/stream", PAGE, ""),
+    ("our own socket from another site", "/stream", {"Origin": "http://evil.test"}, SITE),
+    ("our own socket without an origin", "/stream", {}, SITE),
     ("its socket behind https", "/state?sid=1", {"Origin": "https://localhost:8080"}, ""),
     ("by address", "/ui", {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080"}, ""),
     ("by address, IPv6", "/ui", {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}, ""),
@@ -90,6 +95,7 @@ TOKENS = [  # with a token: name, path, headers, refusal
     ("in a cookie of another name", "/ui", {**PAGE, "Cookie": "legged_mw_1=TOKEN"}, "this page has a token"),
     ("as text of another alphabet", "/?token=\udcff", {}, "this page has a token"),
     ("the right one at another origin", "/ui?token=TOKEN", {"Origin": "http://evil.test"}, SITE),
+    ("none at our own socket", "/stream", PAGE, "this page has a token"),
     ("the right one", "/?token=TOKEN", {}, ""),
     ("at a socket", "/ui?sid=1&token=TOKEN", PAGE, ""),
     ("in its cookie", "/ui?sid=1", {**PAGE, "Cookie": "a=b; legged_mw_8080=TOKEN"}, ""),
@@ -133,6 +139,7 @@ def test_which_pages_have_a_token_and_what_is_opened() -> None:
         "Location": "/",
         "Set-Cookie": f"legged_mw_8080={gate.token}; Path=/; HttpOnly; SameSite=Lax",
     }
+    assert gate.greeting(f"/drawn?token={gate.token}")["Location"] == "/drawn"
     assert not gate.greeting("/?token=abc") and not gate.greeting(f"/ui?token={gate.token}")
 
 
@@ -152,12 +159,54 @@ def answer(port: int, path: str = "/", **headers: str) -> tuple[int, str, Any]:
         return error.code, error.read().decode(), error.headers
 
 
+BAD_REQUESTS: list[str | bytes] = [
+    *("", "x", "[]", "null", "{}", '["press"]', '["press", 1]', '["click", "jump"]', '["steer", 0, 1]', '["steer", -1, 1]'),
+    *('["turn", NaN, 0]', '["zoom", 1e999]', '["push", -1e30]', '["push", "fast"]', f'["press", "{"x" * 300}"]', "[" * 150),
+    *(b"\xff", b"\x00" * 3000),
+]  # fmt: skip
+
+
+def watch(url: str, own: Any, pilot: Pilot) -> None:
+    """Pictures drawn by the server: of the right size, not black; the first page drives, and a bad request ends a page."""
+    from PIL import Image
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    def look(page: Any) -> tuple[dict[str, Any], bytes]:
+        page.send("next")
+        facts = json.loads(page.recv(timeout=60))
+        assert "error" not in facts
+        return facts, page.recv(timeout=60)
+
+    with connect(url + "/stream", origin=own) as late:
+        with connect(url + "/stream", origin=own) as driver:
+            (facts, picture), (watched, _) = look(driver), look(late)
+            assert facts["drives"] and not watched["drives"] and facts["buttons"] and facts["push"]
+            image = Image.open(io.BytesIO(picture))
+            assert (image.format, image.size) == ("JPEG", (640, 360)) and np.asarray(image).max() > 100
+            for page in (late, driver):
+                for request in ('["press", "p"]', '["turn", 0.4, 0.1]', '["zoom", -0.1]', '["push", 99]'):
+                    page.send(request)
+                turned = look(page)
+            pilot.listen()
+            assert len(pilot.take_pushes()) == 1 and pilot.push_speed == PUSH_MAX and turned[1] != picture
+            with connect(url + "/ui?sid=1", origin=own) as studio, pytest.raises(ConnectionClosed, match="4001"):
+                studio.recv(timeout=10)
+            for request in BAD_REQUESTS:
+                with connect(url + "/stream", origin=own) as page, pytest.raises(ConnectionClosed, match="1008"):
+                    page.send(request)
+                    page.recv(timeout=10)
+        until = time.monotonic() + 10
+        while not look(late)[0]["drives"]:
+            assert time.monotonic() < until
+
+
 def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> None:
     from websockets.exceptions import ConnectionClosed, InvalidStatus
     from websockets.sync.client import connect
 
     for turn in range(2):
-        with closing(WebViewer(SPEC, Pilot([]), 1)) as page:
+        with closing(WebViewer(SPEC, pilot := Pilot([]), 1)) as page:
             now = np.zeros((1, 3))
             page.show(
                 Moment(0.0, np.array([[0, 0, 1, 1, 0, 0, 0.0]]), now[:, :0], now, now, np.ones((1, 0), dtype=bool))
@@ -168,7 +217,8 @@ def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> No
             ):
                 WebViewer(SPEC, Pilot([]), 1)
             status, text, headers = answer(page.port)
-            assert status == 200 and "canvas" in text
+            assert status == 200 and 'href="/drawn"' in text
+            assert "let currentModelCrc = 0;" in text  # of Studio's own: our script waits for it
             assert (headers["X-Frame-Options"], headers["Access-Control-Allow-Origin"]) == ("DENY", None)
             if turn:
                 break  # the rest once
@@ -176,7 +226,12 @@ def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> No
                 status, text, headers = answer(page.port, "/model", **refused)
                 assert status == 403 and text.count("\n") == 1 and headers["Cache-Control"] == "no-store"
             url, own = f"ws://127.0.0.1:{page.port}", f"http://127.0.0.1:{page.port}"
-            for path, origin in (("/ui", "http://evil.test"), ("/state", None), ("/drop", own)):
+            for path, origin in (
+                ("/ui", "http://evil.test"),
+                ("/stream", "http://evil.test"),
+                ("/stream", None),
+                ("/drop", own),
+            ):
                 with pytest.raises(InvalidStatus, match="403"):
                     connect(url + path, origin=origin)  # pyright: ignore[reportArgumentType]
             with connect(f"{url}/state?sid=1", origin=own) as state:  # pyright: ignore[reportArgumentType]
@@ -194,6 +249,7 @@ def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> No
                 with pytest.raises(ConnectionClosed, match="1009"):
                     while True:
                         state.recv(timeout=10)
+            watch(url, own, pilot)
             with socket.create_connection(("127.0.0.1", page.port)) as raw:
                 raw.sendall(b"\x00\xff" * 500 + b"\r\n\r\n")
             assert answer(page.port)[0] == 200 and page.is_running()

@@ -1,0 +1,191 @@
+"""The page for a browser that draws too slowly: pictures drawn here, driven over the same guarded port. Also all pages' keys.
+
+`/drawn` is the page and `/stream` its WebSocket; Studio's page sends its keys there too. A browser asks for each picture,
+so a slow link gets fewer of them. One thread draws them all, with a camera of its own that the driving page turns.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import os
+import sys
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from legged_mw.view.drive import ACTIONS
+from legged_mw.view.panel import Panel
+from legged_mw.view.recorder import RobotRenderer
+from legged_mw.view.stage import ViewError
+
+PAGE = Path(__file__).with_name("drawn.html").read_bytes()
+ADDED = Path(__file__).with_name("studio.html").read_bytes()  # to Studio's page: it measures, and sends keys
+WIDTH, HEIGHT = 640, 360  # [px] of a picture
+FPS = 15.0  # ours: pictures a second at most; with more, software OpenGL takes a core from the control loop
+QUALITY = 80  # ours: of the JPEGs, of 100; about 18 kB each
+VIDEO_FPS = 25.0  # the camera's filters count in frames of a video
+WATCHERS = 9  # pages at most, as Studio's own limit
+MESSAGE, MOST = 200, 100.0  # a page's request at most: its length, a number in it
+NEXT = "next"  # a page's request for one more picture
+# codes of closing: Studio's for a page that may not drive and for one too many, WebSocket's for a bad request
+TAKEN, FULL, BAD = 4001, 4002, 1008
+
+Handler = Callable[[Any], Awaitable[None]]
+
+
+class Stream:
+    """Pictures, numbers and requests of the pages at `/stream`. The first page that came drives, of either kind."""
+
+    def __init__(self, spec: mujoco.MjSpec, panel: Panel, count: int) -> None:
+        self._spec, self._panel, self._count = spec, panel, count
+        self._artist = ThreadPoolExecutor(1, "artist", _step_back)  # an OpenGL context belongs to one thread
+        self._renderer: RobotRenderer | None = None  # made for the first page that asks
+        self._picture, self._drawn = b"", 0.0  # the last JPEG, its time [s]
+        self._moves: deque[tuple[int, float, float]] = deque(maxlen=100)  # of the camera, for the next picture
+        self._studio: list[str] = []  # session of each Studio page that drives or waits for it to be free
+        self._watching: list[Any] = []  # sockets that asked for pictures
+
+    def around(self, studio: Handler) -> Handler:
+        """Studio's handler of WebSockets, with `/stream` beside it. While a page of ours drives, no page of Studio's does."""
+        from websockets.exceptions import ConnectionClosed
+
+        async def handle(socket: Any) -> None:
+            path, _, query = socket.request.path.partition("?")
+            if path == "/stream":
+                with suppress(ConnectionClosed):
+                    await self._serve(socket, query)
+            elif path != "/ui":
+                await studio(socket)
+            elif self._watching and not self._studio:
+                await socket.close(TAKEN, "another browser drives")
+            else:
+                self._studio.append(query)
+                try:
+                    await studio(socket)
+                finally:
+                    self._studio.remove(query)
+
+        return handle
+
+    def close(self) -> None:
+        """Free the OpenGL context. May be called twice."""
+        renderer, self._renderer = self._renderer, None
+        with suppress(RuntimeError):  # the interpreter ends
+            if renderer is not None:
+                self._artist.submit(renderer.close)
+            self._artist.shutdown()
+
+    async def _serve(self, socket: Any, session: str) -> None:
+        """Answer one page until it leaves or asks for what there is not."""
+        asked, sender = asyncio.Semaphore(0), None
+        try:
+            async for message in socket:
+                if message != NEXT:
+                    if not self._obey(message, self._drives(socket, session)):
+                        await socket.close(BAD, "no such request")
+                    continue
+                if sender is None and len(self._watching) >= WATCHERS:
+                    await socket.close(FULL, f"{WATCHERS} browsers watch already")
+                elif sender is None:
+                    self._watching.append(socket)
+                    sender = asyncio.create_task(self._send(socket, asked))
+                asked.release()
+        finally:
+            if sender is not None:
+                self._watching.remove(socket)
+                sender.cancel()
+
+    def _drives(self, socket: Any, session: str) -> bool:
+        """Whether this page drives. Of Studio's pages it is the one that Studio has accepted."""
+        return session == self._studio[0] if self._studio else socket in self._watching[:1]
+
+    async def _send(self, socket: Any, asked: asyncio.Semaphore) -> None:
+        """Send the panel's numbers and a picture for each request that `asked` counts."""
+        from websockets.exceptions import ConnectionClosed
+
+        loop, due = asyncio.get_running_loop(), 0.0
+        with suppress(ConnectionClosed):
+            while True:
+                await asked.acquire()
+                await asyncio.sleep(max(0.0, due - loop.time()))
+                while self._panel.moment is None:  # the session has not begun
+                    await asyncio.sleep(1.0 / FPS)
+                due = max(due + 1.0 / FPS, loop.time())
+                try:
+                    picture = await loop.run_in_executor(self._artist, self._draw)
+                except Exception as error:  # the robot's state is not finite, or this machine cannot draw
+                    await socket.send(json.dumps({"error": f"the server cannot draw: {error}"}))
+                    await socket.close()
+                    return
+                await socket.send(json.dumps({**self._panel.facts(), "drives": self._drives(socket, "")}))
+                await socket.send(picture)
+
+    def _draw(self) -> bytes:
+        """The picture of now as a JPEG, or the last one if it is young. On the artist's thread."""
+        now, moment = time.monotonic(), self._panel.moment
+        if moment is not None and now - self._drawn > 0.5 / FPS:
+            try:
+                from PIL import Image
+            except ImportError as error:  # on a robot's computer
+                raise ViewError(f"its JPEGs are written by Pillow ({error}): pip install pillow") from None
+            if self._renderer is None:
+                self._renderer = RobotRenderer(self._spec, WIDTH, HEIGHT, self._count, live=True)
+            while self._moves:
+                self._renderer.move_camera(*self._moves.popleft())
+            frame = self._renderer.frame(moment._replace(lines=()), (now - self._drawn) * VIDEO_FPS)
+            file = io.BytesIO()
+            Image.fromarray(frame).save(file, "JPEG", quality=QUALITY)
+            self._picture, self._drawn = file.getvalue(), now
+        return self._picture
+
+    def _obey(self, message: str | bytes, drives: bool) -> bool:
+        """Do a request of the driving page: a JSON list of a verb and its values. False: there is no such request.
+
+        Requests of a page that watches do nothing. What a page may ask is what the panel offers.
+        """
+        panel, request = self._panel, _request(message)
+        match request:
+            case ["press", str(key)]:
+                act = partial(panel.press, key, studio=bool(self._studio))
+            case ["click", str(action)] if action in ACTIONS:
+                act = partial(panel.click, action)
+            case ["steer", int(column), float(value) | int(value)] if 0 <= column < len(panel.pilot.table):
+                act = partial(panel.steer, column, value)
+            case ["push", float(speed) | int(speed)]:
+                act = partial(panel.set_push, speed)
+            case ["turn", float(x) | int(x), float(y) | int(y)]:  # of the picture's height
+                act = partial(self._moves.append, (mujoco.mjtMouse.mjMOUSE_ROTATE_V, x, y))
+            case ["zoom", float(y) | int(y)]:
+                act = partial(self._moves.append, (mujoco.mjtMouse.mjMOUSE_ZOOM, 0.0, y))
+            case _:
+                return False
+        if drives:
+            act()
+        return True
+
+
+def _step_back() -> None:
+    """Lower the priority of this thread and of those that OpenGL starts from it: the control loop comes first."""
+    if sys.platform == "linux":  # elsewhere it would be the whole process's
+        os.nice(5)
+
+
+def _request(message: str | bytes) -> list[str | float] | None:
+    """The texts and numbers of a page's message; numbers within +-MOST. None: it is something else."""
+    try:
+        request = json.loads(message) if len(message) <= MESSAGE else None
+    except ValueError:
+        return None
+    sound = isinstance(request, list) and all(
+        isinstance(each, str) or (isinstance(each, int | float) and abs(each) <= MOST) for each in request
+    )
+    return request if sound else None
