@@ -302,6 +302,19 @@ def test_episodes_of_one_step_are_said_once_after_a_resume_too() -> None:
     assert [len(health.lengths(numbers)) for _ in range(3)] == [0, 1, 0]  # whatever the number of the iteration is
 
 
+def test_a_robot_that_stands_after_a_quarter_of_its_training_is_said_once() -> None:
+    numbers = {"episodes": 0.0, "episode_length": 1e3, "falls_a_minute": 0.2, "rew_pose": 1.0, "rew_torques": -0.3}
+    for walked, falls, what in ((0.1, 0.2, "weaken torques"), (0.1, 7.0, "falls 7 times"), (0.3, 7.0, "")):
+        health = FiniteCheck([], [])
+        asked = numbers | {"rew_energy": -0.1, "walked": walked, "falls_a_minute": falls}
+        said = [(k, line) for k in range(100) for line in (health.lengths(asked), health.walking(asked, k / 100))[1]]
+        assert [k for k, _ in said] == ([25] if what else []) and all(
+            what in line and "10%" in line for _, line in said
+        )
+    health = FiniteCheck([], [])
+    assert not any(health.lengths(numbers) or health.walking(numbers, 0.5) for _ in range(99)), "not told to walk"
+
+
 @pytest.mark.parametrize(("kp", "what"), [("0", "sags"), ("25000", "unstable")])
 @pytest.mark.parametrize("how", [["--check"], ["--max_iterations", "1"]], ids=["check", "training"])
 def test_gains_that_no_robot_stands_on_are_said(kp: str, what: str, how: list[str], tmp_path: Path) -> None:

@@ -327,6 +327,9 @@ def _clock(seconds: float) -> str:
 # ---- values that are not finite -------------------------------------------------------------------------------------
 
 IN_A_ROW = 3  # ours: iterations; one bad value is an accident, and the next rollout is another
+# ours: share of a training, not of its first iterations alone; of the command: 17 trainings of 88 to 228 M steps had 0.49
+QUARTER, BEGUN, WALKS = 0.25, 20, 0.25
+OFTEN = 3.0  # ours: falls a minute, from which on falling is what keeps it from walking
 
 
 class FiniteCheck:
@@ -339,6 +342,7 @@ class FiniteCheck:
         self._undone_in_a_row = 0
         self._bad_in_a_row = 0  # iterations with too many bad values
         self._iterations = 0  # of this process
+        self._looked = False  # whether it walks
         self._counts: dict[str, float] = {}  # name -> bad values so far
 
     def judge(self, counts: Sequence[float], steps: int, undone: bool, wrong: Sequence[float]) -> tuple[list[str], str]:
@@ -379,6 +383,24 @@ class FiniteCheck:
         said = ", ".join(f"{count:.0f} {end}" for end, count in ends.items() if count)
         lasted = f"episodes last {numbers['episode_length']:.1f} steps ({said})"
         return [f"{lasted}: unless that is meant, nothing can be learned; --check names the rule that ends them"]
+
+    def walking(self, numbers: Mapping[str, float], done: float) -> list[str]:
+        """A warning once, from a quarter of the training on (``done``: its share), if robots that are to walk stand."""
+        walked = numbers.get("walked", math.nan)
+        if self._looked or done < QUARTER or self._iterations < BEGUN or math.isnan(walked):
+            return []
+        self._looked = True
+        if walked >= WALKS:
+            return []
+        penalties = {name[4:]: value for name, value in numbers.items() if name.startswith("rew_") and value < 0.0}
+        largest = min(penalties, key=lambda name: penalties[name], default="")
+        advice = (
+            f"raise rewards.scales.tracking_lin_vel{f', or weaken {largest}, the largest penalty' if largest else ''}"
+        )
+        if (falls := numbers["falls_a_minute"]) > OFTEN:
+            advice = f"it falls {falls:.0f} times a minute: weaken perturbation and domain_rand"
+        said = f"after {done:.0%} of the training it walks {walked:.0%} of the command: it stands"
+        return [f"{said}; {advice}, set commands.curriculum = True, or train longer"]
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
         """Name -> count above 0; of a row with several columns, the largest."""

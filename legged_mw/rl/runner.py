@@ -308,7 +308,7 @@ class Runner(OnPolicyRunner):
             report.iteration, self.schedule.last, self._next_exam(report.iteration), numbers, rows, speed
         )
         warnings, verdict = self._finite_check.judge(read.nonfinite, report.steps, read.undone[0] > 0, read.wrong)
-        warnings += self._finite_check.lengths(numbers)
+        warnings += self._finite_check.lengths(numbers) + self._finite_check.walking(numbers, self.schedule.done)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:
             self.diverged, self.stop = self.diverged or verdict, self.stop or "learning has died"
