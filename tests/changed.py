@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.chirp import Chirp, at_rate, at_rate_limits
+from legged_mw.deploy.chirp import Chirp, at_rate
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.joint_check import LIFT, JointCheck
@@ -19,7 +19,7 @@ from legged_mw.deploy.runner import Summary, run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.unitree.client import UnitreeRobot
 from legged_mw.unitree.link import Received
-from legged_mw.unitree.serve import STEP, SimulatedUnitree
+from legged_mw.unitree.serve import SimulatedUnitree
 from tests.drivers import Script
 
 ENCODER, SPEED, GYRO, FORCE = 0.001, 0.02, 0.005, 0.05  # [rad], [rad/s], [rad/s], [m/s^2] standard deviations of noise
@@ -93,7 +93,8 @@ class Memory:
     """Both ends of a wire without a network: a command that is sent lets the robot make one step."""
 
     def __init__(self) -> None:
-        self.state, self.command, self.sim = b"", b"", None
+        self.state, self.command = b"", b""
+        self.sim: SimulatedUnitree | None = None
 
     def send(self, body: Any, stamp: float | None = None, safe: bool = False) -> None:
         """A state of the robot; with a stamp a command to it."""
@@ -135,7 +136,7 @@ class Swept(Chirp):
 
     def _check(self, measured: Any) -> Any:
         self.state = "chirp"
-        yield from self._chirp()
+        yield from self._chirp(measured)
 
 
 def chirp(folder: Path, change: Change, path: Path, checked: bool = False) -> Summary:
@@ -143,12 +144,9 @@ def chirp(folder: Path, change: Change, path: Path, checked: bool = False) -> Su
     contract, end = read_contract(folder), Memory()
     sim = end.sim = ChangedUnitree(folder, contract, end, change, hoist=True, lift=LIFT)
     sim.step()
-    fast = at_rate(contract, STEP)
-    robot = UnitreeRobot(fast, Owner(end), Owner(end).receive(), simulated=True, clock=lambda: sim.time)
-    limits = at_rate_limits(Limits.of(folder, fast, robot.limits), contract.period / STEP)
+    robot = UnitreeRobot(contract, Owner(end), Owner(end).receive(), simulated=True, clock=lambda: sim.time)
+    fast, limits = at_rate(contract, Limits.of(folder, contract, robot.limits), robot)
     controller, safety = Controller(folder, fast), Safety(fast, limits)
     states: JointCheck = (Chirp if checked else Swept)(controller, [Script({500: "start"})], print, robot, limits)
     log = Log(path, fast, folder, "simulated")
-    return run(
-        robot, controller, lambda _: np.zeros(0), 300.0, live=False, safety=safety, states=states, log=log
-    )
+    return run(robot, controller, lambda _: np.zeros(0), 300.0, live=False, safety=safety, states=states, log=log)

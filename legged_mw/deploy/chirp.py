@@ -16,27 +16,32 @@ from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import InputSource
 from legged_mw.deploy.joint_check import JointCheck, Moves
-from legged_mw.deploy.robot import Floats, Measurement, Robot
+from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHIRP, Order
 
 SECONDS = 58.0  # [s] ours: of all sweeps together
-MOVE, REST = 2.0, 0.2  # [s] ours: to the default pose; before each sweep
+MOVE, SETTLE, REST = 2.0, 1.0, 0.2  # [s] ours: to the default pose; there; before and after each sweep
 FADE = 0.3  # [s] ours: in which a sweep's amplitude rises, and falls
 AMPLITUDE, FASTEST = 0.4, 4.0  # [rad], [rad/s] ours: of a target, at most
 TORQUE, ROOM, SPEED = 0.4, 0.8, 0.3  # [share] of the motor's torque, of the way to the range's end, of the top speed
 SLOWEST, RANGE, ABOVE = 0.5, (3.0, 15.0), 3.0  # [Hz] begin and limits of the end; end by the servo's own frequency
 
 
-def at_rate(contract: Contract, step: float) -> Contract:
-    """The contract for a run with one measurement each ``step`` [s]; the policy does not act in it."""
-    return replace(contract, period=step, decimation=1)
+def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract, Limits]:
+    """Contract and limits of a run in which each measurement of ``robot`` is a step, and the policy does not act.
 
-
-def at_rate_limits(limits: Limits, slower: float) -> Limits:
-    """Limits that count steps, for steps that are ``slower`` times as short."""
-    return limits.but({name: slower * getattr(limits, name) for name in ("age", "frozen", "late")}, "--chirp")
+    Raises RobotError if the robot measures no faster than a policy acts.
+    """
+    if robot.step is None:
+        raise RobotError(
+            f"--chirp needs measurements each few ms, and {type(robot).__name__} gives one a period: take --robot unitree, "
+            "on lo for one that --serve simulates"
+        )
+    slower = contract.period / robot.step
+    counted = {name: slower * getattr(limits, name) for name in ("age", "frozen", "late")}  # in steps
+    return replace(contract, period=robot.step, decimation=1), limits.but(counted, "--chirp")
 
 
 class Chirp(JointCheck):
@@ -76,14 +81,14 @@ class Chirp(JointCheck):
         yield from super()._check(measured)
         if super().right:
             self._enter(CHIRP, self._now, "each joint follows a sine of rising frequency")
-            yield from self._chirp()
+            yield from self._chirp(measured)
 
-    def _chirp(self) -> Moves:
-        period = self.controller.contract.period
-        measured = yield self._held(self._pose)
-        begin, count = measured.joint_pos.copy(), round(MOVE / period)
-        for step in range(count):
-            yield self._held(begin + (step + 1) / count * (self._pose - begin))
+    def _chirp(self, begun: Measurement) -> Moves:
+        """From where the joint check held the joints, as ``begun``, to the default pose, and all sweeps."""
+        begin = np.clip(begun.joint_pos, self._limits.lowest, self._limits.highest)
+        count, settle = (round(seconds / self.controller.contract.period) for seconds in (MOVE, SETTLE))
+        for step in range(count + settle):
+            yield self._held(begin + min(1.0, (step + 1) / count) * (self._pose - begin))
         for joint in range(len(self.joints)):
             yield from self._sweep(joint)
             self._swept += 1
@@ -120,6 +125,8 @@ def _extent(controller: Controller, limits: Limits) -> tuple[Floats, Floats]:
     mujoco.mj_fullM(scene.model, data, inertia)
     own = np.sqrt(contract.stiffness / np.diag(inertia)[scene.dofs]) / (2.0 * math.pi)
     pose = contract.default_pose
-    room = ROOM * np.minimum(pose - np.maximum(limits.low, limits.lowest), np.minimum(limits.high, limits.highest) - pose)
+    room = ROOM * np.minimum(
+        pose - np.maximum(limits.low, limits.lowest), np.minimum(limits.high, limits.highest) - pose
+    )
     amplitude = np.minimum(AMPLITUDE, np.minimum(TORQUE * limits.motor / contract.stiffness, np.maximum(room, 0.0)))
     return amplitude, np.clip(ABOVE * own, *RANGE)

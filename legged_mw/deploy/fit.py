@@ -1,35 +1,48 @@
-"""Fit a robot's own numbers to the log of its chirp: delay, armature, friction, damping, gain and encoder offset per joint.
+"""A robot's own numbers from the log of its chirp: delay, armature, friction, damping, gain and encoder offset a joint.
 
-Each joint's sweep is replayed in MuJoCo's C engine. Root and gravity move as the IMU measured them, so the robot may
-swing on its rope; joints that are held are simulated too. mujoco.minimize.least_squares finds the numbers with which
-angles and speeds are nearest to those measured.
+Each joint's sweep is replayed in MuJoCo's C engine with the rest of its leg or arm. The root and gravity move as the
+IMU felt them, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers with which angles
+and speeds are nearest to those measured.
 """
 
 from __future__ import annotations
 
+import argparse
 import copy
 import tempfile
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from mujoco import minimize, rollout
+from mujoco import minimize
+from mujoco.rollout import Rollout
 
+from legged_mw.deploy.chirp import REST, SLOWEST
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.log import DriveLog, LogError, read_log
 from legged_mw.deploy.robot import Floats
-from legged_mw.deploy.simulated import DeployScene, read_scene
+from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHIRP, STATES
-from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.cli import Parser
+from legged_mw.utils.errors import UserError, shown, unknown
+from legged_mw.utils.files import typed
+from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.yaml_file import save_yaml
 
-SC = 'jac'
-ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: weights of the residual, about the noise of encoders
-HEAVY = 1e6  # [kg], [kg m^2] on the root, which then moves as it is told
-SMOOTH = 5  # measurements over which the gyro is averaged before its slope is taken
-STARTS = (4.0, 16.0)  # [ms] delays to begin with
+ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
+HEAVY = 1e6  # [kg], [kg m^2] ours: of a root that moves as it is told
+SMOOTH = 5  # ours: measurements in a mean of the gyro, before its slope is taken
+ENCODER = 0.01  # [rad] ours: how far an encoder is off, where gravity does not show it
+TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
+BLOCK = 50  # ours: measurements in a row whose errors may be alike
+STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: of the optimiser, in the scale of each number
+SLOW = 0.005  # [s] ours: a log of slower measurements shows neither delay nor armature
+SHORT = 0.9  # [share] ours: of the longest sweep; a shorter one is cut off
+MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.95  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
 
 
 class Parameter(NamedTuple):
@@ -37,215 +50,434 @@ class Parameter(NamedTuple):
 
     name: str
     unit: str
-    scale: float  # in the unit of the fit: one per unit
+    digits: int
+    scale: float  # of a change that matters, for the optimiser
     low: float
     high: float
+    start: tuple[float, float]  # of the random starts; of the armature a factor on the scene's
 
 
 PARAMETERS = (
-    Parameter("delay", "ms", 1.0, 0.0, 60.0),
-    Parameter("armature", "kg m^2", 0.01, 1e-4, 1.0),
-    Parameter("frictionloss", "N m", 0.1, 0.0, 10.0),
-    Parameter("damping", "N m s/rad", 0.1, 0.0, 10.0),
-    Parameter("gain", "-", 0.1, 0.2, 3.0),
-    Parameter("offset", "rad", 0.01, -0.2, 0.2),
+    Parameter("delay", "ms", 1, 1.0, 0.0, 100.0, (0.0, 30.0)),
+    Parameter("armature", "kg m^2", 4, 0.01, 1e-4, 1.0, (0.4, 8.0)),
+    Parameter("friction", "N m", 3, 0.1, 0.0, 20.0, (0.0, 1.5)),
+    Parameter("damping", "N m s/rad", 3, 0.1, 0.0, 20.0, (0.0, 0.6)),
+    Parameter("gain", "-", 3, 0.1, 0.2, 3.0, (0.7, 1.3)),
+    Parameter("offset", "rad", 4, 0.01, -0.2, 0.2, (0.0, 0.0)),
 )
-NAMES = tuple(each.name for each in PARAMETERS)
-
-
-class Fitted(NamedTuple):
-    """The numbers of one joint, in the order of PARAMETERS."""
-
-    joint: int
-    values: Floats  # (6,)
-    deviation: Floats  # (6,) standard deviation
-    before: float  # [rad] RMS of the angle's error with the scene's numbers
-    after: float  # [rad] with the fitted ones
-    explained: float  # share of the variance of the angle
-    time: Floats  # (T,) [s]
-    measured: Floats  # (T,) [rad]
-    nominal: Floats  # (T,) [rad] simulated with the scene's numbers
-    simulated: Floats  # (T,) [rad] with the fitted ones
+DELAY, ARMATURE, FRICTION, DAMPING, GAIN, OFFSET = range(len(PARAMETERS))
+_SCALE, _LOW, _HIGH = (np.array([getattr(each, name) for each in PARAMETERS]) for name in ("scale", "low", "high"))
 
 
 class Sweep(NamedTuple):
     """One joint's part of a log, at even times."""
 
     joint: int
+    rest: int  # measurements at rest, at the begin
     time: Floats  # (T,) [s] of measurements
-    sent: Floats  # (S,) [s] of targets
-    target: Floats  # (S, D) [rad]
     angle: Floats  # (T, D) [rad]
     speed: Floats  # (T, D) [rad/s]
-    force: Floats  # (T, 6) on a heavy root
+    root: Floats  # (T, 6) [m/s^2] world frame, [rad/s^2] body frame: of the root, with gravity pulled off
+    sent: Floats  # (S,) [s] of targets
+    target: Floats  # (S, D) [rad]
 
 
-class Model:
-    """The hanging robot: servos as actuators, a root that moves as it is told."""
+class FittedJoint(NamedTuple):
+    """The numbers of one joint, in the order of PARAMETERS, and how well they replay its sweep."""
 
-    def __init__(self, spec: mujoco.MjSpec, contract: Contract, step: float, joint: str) -> None:
-        """Raises nothing."""
-        spec = spec.copy()
-        own, root = spec.joint(joint).parent, spec.worldbody.first_body()
-        while own.parent.name != root.name:
-            own = own.parent
-        for sensor in list(spec.sensors):
-            spec.delete(sensor)
-        for key in list(spec.keys):
-            spec.delete(key)
-        for body in list(root.bodies):
-            if body.name != own.name:
-                spec.delete(body)
-        for body in spec.bodies[1:]:
-            for geom in list(body.geoms):
-                if body.explicitinertial:
-                    spec.delete(geom)
-        self.model = model = spec.compile()
-        self.joints = [name for name in contract.joints if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0]
-        self.index = [contract.joints.index(name) for name in self.joints]
-        self.own = self.joints.index(joint)
-        self.dofs = np.array([int(model.joint(name).dofadr[0]) for name in self.joints])
-        self.actuators = np.array([model.actuator(name).id for name in self.joints])
-        contract = replace(contract, joints=tuple(self.joints), stiffness=contract.stiffness[self.index], damping=contract.damping[self.index])
-        self.angles = np.array([int(model.joint(name).qposadr[0]) for name in contract.joints])
-        model.opt.timestep, model.opt.integrator = step, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        model.opt.iterations, model.opt.ls_iterations = 100, 50
-        model.opt.gravity[:] = 0.0
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_SENSOR
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        model.dof_armature[:6] = HEAVY
-        model.dof_damping[self.dofs] = 0.0
-        model.actuator_ctrllimited[:] = 0
-        model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
-        model.actuator_gainprm[self.actuators, 0] = contract.stiffness
-        model.actuator_biasprm[self.actuators, :3] = np.stack(
-            [np.zeros_like(contract.stiffness), -contract.stiffness, -contract.damping], axis=1
-        )
-        self.nominal = np.array(
-            [
-                [0.0, model.dof_armature[dof], model.dof_frictionloss[dof], 0.0, 1.0, 0.0]
-                for dof in self.dofs
-            ]
-        )
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-        self._pool = rollout.Rollout(nthread=2)
-        self._data = [mujoco.MjData(model) for _ in range(2)]
+    joint: int
+    values: Floats  # (6,)
+    deviation: Floats  # (6,) standard deviation, by the residual and its derivatives
+    before: float  # [rad] RMS of the angle's error with the scene's numbers
+    after: float  # [rad] with the fitted ones
+    time: Floats  # (T,) [s]
+    angles: Floats  # (3, T) [rad] measured, simulated with the scene's numbers, and with the fitted ones
 
-    def simulate(self, sweep: Sweep, values: Floats) -> tuple[Floats, Floats]:
-        """Measured angles and speeds (K, T) of the sweep's joint with ``values`` (K, 6)."""
-        joint, model = self.own, self.model
-        dof, actuator = self.dofs[joint], self.actuators[joint]
-        models = [copy.copy(model) for _ in values]
-        count = len(sweep.time)
-        control = np.empty((len(values), count, model.nu + model.nv))
-        control[..., self.actuators] = [
-            np.stack([np.interp(sweep.time, sweep.sent, each) for each in sweep.target[:, self.index].T], axis=1)
+
+@dataclass(frozen=True)
+class Fit:
+    """The fit of one log."""
+
+    contract: Contract
+    recording: DriveLog
+    nominal: Floats  # (D, 6) numbers of the scene
+    joints: list[FittedJoint]
+    seconds: float  # [s] that it took
+
+    @property
+    def values(self) -> Floats:
+        """(D, 6)"""
+        return np.array([each.values for each in self.joints])
+
+    @property
+    def deviation(self) -> Floats:
+        """(D, 6)"""
+        return np.array([each.deviation for each in self.joints])
+
+
+# ---- the log
+
+
+def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
+    """Fit ``joints`` (default: all) of the log. Raises LogError, ContractError.
+
+    Twice: at first held joints are as in the scene, then as they were fitted.
+    """
+    began, recording = time.monotonic(), read_log(path)
+    with tempfile.TemporaryDirectory() as own:
+        for name, content in recording.files.items():
+            (Path(own) / name).write_bytes(content)
+        folder = Path(own) if recording.files else Path(recording.header["export"])
+        contract = read_contract(folder)
+        if contract.digest != recording.header["network"]:
+            raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)}")
+        scene = read_scene(folder, contract)
+    for name in joints:
+        if name not in contract.joints:
+            raise UserError(f"--joint: {unknown('joint', name, contract.joints, shown(path))}")
+    sweeps = read_sweeps(path, recording, contract, scene.model)
+    model, dofs = scene.model, scene.dofs
+    nominal = np.zeros((len(dofs), len(PARAMETERS)))
+    nominal[:, ARMATURE], nominal[:, FRICTION] = model.dof_armature[dofs], model.dof_frictionloss[dofs]
+    nominal[:, GAIN] = 1.0
+    values, fitted = nominal.copy(), list[FittedJoint]()
+    for turn in range(2):
+        fitted = [
+            _fit_joint(Chain(scene.spec, contract, sweep), values, nominal, turn > 0)
+            for sweep in sweeps
+            if not joints or contract.joints[sweep.joint] in joints
         ]
-        control[..., model.nu :] = 0.0
-        control[..., model.nu : model.nu + 6] = sweep.force
-        size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        start = np.zeros((len(values), size))
-        qpos = np.zeros(model.nq)
-        qpos[3], qpos[self.angles] = 1.0, sweep.angle[:20, self.index].mean(axis=0)
-        start[:, 1 : 1 + model.nq] = qpos
-        for k, (own, (delay, armature, friction, damping, gain, offset)) in enumerate(zip(models, values, strict=True)):
-            own.dof_armature[dof], own.dof_frictionloss[dof], own.dof_damping[dof] = armature, friction, damping
-            own.actuator_gainprm[actuator, 0] *= gain
-            own.actuator_biasprm[actuator, 1:3] *= gain
-            control[k, :, actuator] = np.interp(sweep.time - delay / 1000.0, sweep.sent, sweep.target[:, sweep.joint]) - offset
-            start[k, 1 + self.angles[joint]] -= offset
-        spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
-        states, _ = self._pool.rollout(models, self._data, start, control, control_spec=spec, skip_checks=False)
-        # states after each step
-        angle = np.concatenate([start[:, None, 1 + self.angles[joint]], states[:, :-1, 1 + self.angles[joint]]], axis=1)
-        at = 1 + model.nq + dof
-        speed = np.concatenate([start[:, None, at], states[:, :-1, at]], axis=1)
-        return angle + values[:, 5:], speed
+        for each in fitted:
+            values[each.joint] = each.values
+    for each in fitted:
+        _check_explained(path, contract.joints[each.joint], each)
+    return Fit(contract, recording, nominal, fitted, time.monotonic() - began)
 
 
-def sweeps(recording: DriveLog, contract: Contract, model: Any) -> list[Sweep]:
-    rows = {name: values.astype(float) for name, values in recording.rows.items()}
-    on = np.flatnonzero(rows["state"][:, 0] == STATES.index(CHIRP))
-    rows = {name: values[on] for name, values in rows.items()}
-    late = rows["time"][:, 0] + rows["behind"][:, 0]
-    measured = late - np.nan_to_num(rows["age"][:, 0])
-    sent = late + np.nan_to_num(np.append(rows["work"][1:, 0], rows["work"][-1:, 0]))
+def read_sweeps(path: Path, recording: DriveLog, contract: Contract, model: mujoco.MjModel) -> list[Sweep]:
+    """The sweeps of all joints. Raises LogError for a log without them, or of a joint that cannot be fitted."""
+    on = recording.rows["state"][:, 0] == STATES.index(CHIRP)
+    rows = {name: values[on].astype(float) for name, values in recording.rows.items()}
+    if not on.any() or rows["joint_pos"].shape[1] != len(contract.joints):
+        raise LogError(f"{shown(path)} holds no chirp: record one with legged-mw deploy EXPORT --chirp ...")
     step = float(np.median(np.diff(rows["time"][:, 0])))
-    rest = rows["target"][-1]
-    found = []
-    for joint in range(len(contract.joints)):
-        moves = np.flatnonzero(np.abs(rows["target"][:, joint] - rest[joint]) > 1e-6)
-        moves = moves[moves > 1050]
-        part = slice(max(0, moves[0] - 60), moves[-1] + 60)
-        time = np.arange(measured[part][0], measured[part][-1], step)
-        even = {
-            name: np.stack([np.interp(time, measured[part], each) for each in rows[name][part].T], axis=1)
-            for name in ("joint_pos", "joint_vel", "ang_vel", "acceleration")
-        }
-        found.append(
-            Sweep(
-                joint, time, sent[part], rows["target"][part], even["joint_pos"], even["joint_vel"],
-                root_force(model, contract, even["ang_vel"], even["acceleration"], step),
-            )
+    if not 0.0 < step <= SLOW:
+        raise LogError(
+            f"{shown(path)} has a measurement each {1e3 * step:.0f} ms, and a fit needs one each {1e3 * SLOW:.0f}"
         )
-    return found
+    moved = np.abs(rows["target"] - contract.default_pose) > 1e-5
+    still = np.flatnonzero(~moved.any(axis=1))
+    moved[: still[0] if len(still) else len(moved)] = False  # on the way to the pose
+    spans = [np.flatnonzero(column) for column in moved.T]
+    lengths = np.array([each[-1] - each[0] if len(each) else 0 for each in spans])
+    if (short := lengths < SHORT * max(1, lengths.max())).any():
+        first = int(np.argmax(short))
+        raise LogError(
+            f"{shown(path)} ends before the sweep of {contract.joints[first]} does, joint {first + 1} of {len(spans)}: "
+            "record the chirp again"
+        )
+    rest = round(REST / step)
+    parts = [{n: v[max(0, span[0] - rest) : span[-1] + rest] for n, v in rows.items()} for span in spans]
+    for joint, part in enumerate(parts):
+        _check_joint(path, contract.joints[joint], joint, part, step)
+    return [_sweep(joint, part, contract, model, step) for joint, part in enumerate(parts)]
 
 
-def root_force(model: Any, contract: Contract, gyro: Floats, acceleration: Floats, step: float) -> Floats:
-    """(T, 6) force and torque on the heavy root, that move it as an IMU in free fall would feel it."""
-    site = model.site(contract.imu)
-    data = mujoco.MjData(model)
-    data.qpos[:] = 0.0
-    data.qpos[3] = 1.0
-    mujoco.mj_kinematics(model, data)
-    turn, place = data.site_xmat[site.id].reshape(3, 3), data.site_xpos[site.id]
-    omega, felt = gyro @ turn.T, acceleration @ turn.T
-    window = np.ones(SMOOTH) / SMOOTH
-    smooth = np.stack([np.convolve(np.pad(each, SMOOTH // 2, "edge"), window, "valid") for each in omega.T], axis=1)
-    slope = np.gradient(smooth, step, axis=0)
-    linear = felt - np.cross(slope, place) - np.cross(smooth, np.cross(smooth, place))
-    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(linear)
-    for i in range(len(linear)):
-        mujoco.mju_quat2Mat(rotation, quaternion)
-        world[i] = rotation.reshape(3, 3) @ linear[i]
-        mujoco.mju_quatIntegrate(quaternion, smooth[i], step)
-    return HEAVY * np.concatenate([world, slope], axis=1)
+def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], step: float) -> None:
+    """Raise LogError if the encoder is dead, or the joint does not follow its target."""
+    target, angle, speed = (rows[key][:, joint] for key in ("target", "joint_pos", "joint_vel"))
+    jumps = float(np.abs(np.diff(angle) - step * speed[1:]).max())
+    slow = slice(0, round(1.5 / SLOWEST / step))  # the slowest swings, which each joint can follow
+    went, told = float(np.ptp(angle[slow])), float(np.ptp(target[slow]))
+    if not np.isfinite([angle, speed]).all() or not np.ptp(angle) > 0.0:
+        why = "its encoder is dead: the angle is the same throughout"
+    elif jumps > JUMP:
+        why = f"its encoder jumps by {jumps:.2f} rad between two measurements"
+    elif went < MOVED * told:
+        why = f"it went {went:.2f} rad where its target went {told:.2f}: its motor is loose, or it is blocked"
+    else:
+        return
+    raise LogError(f"{shown(path)}: {name} cannot be fitted: {why}")
 
 
-def fit_joint(model: Model, sweep: Sweep) -> Fitted:
-    scale = np.array([each.scale for each in PARAMETERS])
-    bounds = [np.array([getattr(each, end) for each in PARAMETERS]) / scale for end in ("low", "high")]
-    measured = np.concatenate([sweep.angle[:, sweep.joint] / ANGLE, sweep.speed[:, sweep.joint] / SPEED])
+def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
+    """Raise LogError if the best numbers do not replay the joint's motion."""
+    explained = 1.0 - fitted.after**2 / float(fitted.angles[0].var())
+    if explained < EXPLAINED:
+        raise LogError(
+            f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.0%} of its motion; "
+            "it is loose, touches something, or is not this robot's"
+        )
 
-    def residual(x: Floats) -> Floats:
-        values = x.reshape(len(x), -1).T * scale
-        angle, speed = model.simulate(sweep, values)
-        return np.nan_to_num(np.concatenate([angle / ANGLE, speed / SPEED], axis=1).T - measured[:, None], nan=1e6)
 
-    found = []
-    rng = np.random.default_rng(0)
-    many = np.tile(model.nominal[model.own], (64, 1))
-    many[:, 0] = rng.uniform(0.0, 30.0, 64)
-    many[:, 1] *= np.exp(rng.uniform(-1.0, 2.0, 64))
-    many[:, 2] = np.exp(rng.uniform(-3.0, 0.0, 64)) * many[:, 2] * 5
-    many[:, 3] = rng.uniform(0.0, 1.0, 64) * 0.5
-    many[:, 4] = rng.uniform(0.7, 1.3, 64)
-    cost = (residual((many / scale).T)**2).sum(axis=0)
-    for begin in many[np.argsort(cost)[:2]]:
-        x, trace = minimize.least_squares(begin / scale, residual, bounds=bounds, eps=1e-4, xtol=1e-4, verbose=0, max_iter=40, x_scale=SC)
-        found.append((float(trace[-1].objective), x, len(trace)))
-    objective, x, _ = min(found, key=lambda each: each[0])
-    error = residual(x[:, None])
-    jacobian, _ = minimize.jacobian_fd(residual, x[:, None], error, 1e-4, 0, [each[:, None] for each in bounds])
-    error = error[:, 0]
-    spread = float(error @ error) / (len(error) - len(x))
-    cov = spread * np.linalg.pinv(jacobian.T @ jacobian)
-    nominal, _ = model.simulate(sweep, model.nominal[model.own][None])
-    simulated, _ = model.simulate(sweep, (x * scale)[None])
-    angle = sweep.angle[:, sweep.joint]
-    rms = lambda error: float(np.sqrt((error**2).mean()))
-    print([f[2] for f in found], cost.min(), [f[0] for f in found])
-    return Fitted(
-        sweep.joint, x * scale, np.sqrt(np.diag(cov)) * scale, rms(nominal[0] - angle), rms(simulated[0] - angle),
-        1.0 - rms(simulated[0] - angle) ** 2 / float(angle.var()), sweep.time, angle, nominal[0], simulated[0],
+def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoco.MjModel, step: float) -> Sweep:
+    """One joint's rows at even times, each at the time when it was measured, or sent."""
+    begins = rows["time"][:, 0] + rows["behind"][:, 0]
+    measured = begins - np.nan_to_num(rows["age"][:, 0])
+    sent = begins + np.append(rows["work"][1:, 0], rows["work"][-1:, 0])  # a row has the work of the step before
+    times = np.arange(measured[0], measured[-1], step)
+    names = ("joint_pos", "joint_vel", "ang_vel", "acceleration")
+    angle, speed, gyro, felt = (
+        np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
     )
+    root = _root_motion(contract, model, gyro, felt, step)
+    return Sweep(joint, round(REST / step), times - times[0], angle, speed, root, sent - times[0], rows["target"])
+
+
+def _root_motion(contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: Floats, step: float) -> Floats:
+    """(T, 6) acceleration of the root in a world without gravity, in which it begins level.
+
+    ``gyro`` and ``felt`` (T, 3): of the IMU, its frame.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    mujoco.mj_kinematics(model, data)
+    place, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
+    even, window = np.pad(gyro @ turn.T, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
+    omega = np.stack([np.convolve(column, window, "valid") for column in even.T], axis=1)
+    turning = np.gradient(omega, step, axis=0)
+    own = felt @ turn.T - np.cross(turning, place) - np.cross(omega, np.cross(omega, place))
+    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(own)
+    for i in range(len(own)):
+        mujoco.mju_quat2Mat(rotation, quaternion)
+        world[i] = rotation.reshape(3, 3) @ own[i]
+        mujoco.mju_quatIntegrate(quaternion, omega[i], step)
+    return np.concatenate([world, turning], axis=1)
+
+
+# ---- the replay
+
+
+class Chain:
+    """The leg or arm of a sweep's joint on a root that moves as it is told, in MuJoCo."""
+
+    def __init__(self, spec: mujoco.MjSpec, contract: Contract, sweep: Sweep) -> None:
+        self.sweep = sweep
+        self.model = model = _only_chain(spec, contract.joints[sweep.joint])
+        self.all = [i for i, name in enumerate(contract.joints) if _has_joint(model, name)]  # in the contract
+        self.own = self.all.index(sweep.joint)
+        joints = [model.joint(contract.joints[i]) for i in self.all]
+        self.dofs = np.array([joint.dofadr[0] for joint in joints])
+        self.angles = np.array([joint.qposadr[0] for joint in joints])
+        self.actuators = np.array([model.actuator(contract.joints[i]).id for i in self.all])
+        self.stiffness, self.damping = contract.stiffness[self.all], contract.damping[self.all]
+        model.opt.timestep, model.opt.integrator = np.diff(sweep.time[:2])[0], mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations, model.opt.gravity[:] = 100, 50, 0.0
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        model.dof_armature[:6], model.actuator_ctrllimited[:] = HEAVY, 0
+        model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
+        threads = usable_cores()
+        self._rollout, self._data = Rollout(nthread=threads), [mujoco.MjData(model) for _ in range(threads)]
+
+    def simulate(self, values: Floats, others: Floats) -> tuple[Floats, Floats]:
+        """What the joint's encoder says, angles and speeds (K, T), with ``values`` (K, 6) and all joints' (D, 6)."""
+        table = np.repeat(others[None, self.all], len(values), axis=0)  # (K, J, 6)
+        table[:, self.own] = values
+        sweep, model = self.sweep, self.model
+        control = np.zeros((len(values), len(sweep.time), model.nu + model.nv))
+        control[:, :, model.nu : model.nu + 6] = HEAVY * sweep.root
+        start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        start[:, 4] = 1.0  # time, place, attitude
+        speeds = sweep.speed[: sweep.rest, self.all].mean(axis=0)
+        middle = sweep.angle[: sweep.rest, self.all].mean(axis=0) - table[:, :, OFFSET]
+        start[:, 1 + self.angles] = middle - speeds * sweep.time[: sweep.rest].mean()
+        start[:, 1 + model.nq + self.dofs] = speeds
+        for k, numbers in enumerate(table):
+            for i, actuator in enumerate(self.actuators):
+                when = sweep.time - numbers[i, DELAY] / 1000.0
+                targets = np.interp(when, sweep.sent, sweep.target[:, self.all[i]])
+                control[k, :, actuator] = targets - numbers[i, OFFSET]
+        spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+        models = [self._with(numbers) for numbers in table]
+        after, _ = self._rollout.rollout(models, self._data, start, control, control_spec=spec)
+        states = np.concatenate([start[:, None], after[:, :-1]], axis=1)
+        angle, speed = states[..., 1 + self.angles[self.own]], states[..., 1 + model.nq + self.dofs[self.own]]
+        return angle + table[:, self.own, OFFSET, None], speed
+
+    def _with(self, numbers: Floats) -> mujoco.MjModel:
+        """The model with the numbers (J, 6) of its joints."""
+        model, servo = copy.copy(self.model), self.actuators
+        model.dof_armature[self.dofs], model.dof_frictionloss[self.dofs] = numbers[:, ARMATURE], numbers[:, FRICTION]
+        model.dof_damping[self.dofs] = numbers[:, DAMPING]
+        stiffness, damping = numbers[:, GAIN] * self.stiffness, numbers[:, GAIN] * self.damping
+        model.actuator_gainprm[servo, 0] = stiffness
+        model.actuator_biasprm[servo, :3] = np.stack([np.zeros_like(stiffness), -stiffness, -damping], axis=1)
+        return model
+
+
+def _has_joint(model: mujoco.MjModel, name: str) -> bool:
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0
+
+
+def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
+    """The robot without the legs and arms that ``joint`` is not in; a root that moves as it is told parts them."""
+    spec = spec.copy()
+    root, own = spec.worldbody.first_body(), spec.joint(joint).parent
+    while own.parent.name != root.name:
+        own = own.parent
+    for each in [*spec.sensors, *spec.keys, *[body for body in root.bodies if body.name != own.name]]:
+        spec.delete(each)
+    return spec.compile()
+
+
+# ---- the fit of a joint
+
+
+def _fit_joint(chain: Chain, values: Floats, nominal: Floats, again: bool) -> FittedJoint:
+    """Fit one joint among joints with ``values`` (D, 6): from random starts, or ``again`` from its own values."""
+    sweep, joint = chain.sweep, chain.sweep.joint
+    angle, speed = sweep.angle[:, joint], sweep.speed[:, joint]
+    measured = np.concatenate([angle / ANGLE, speed / SPEED])
+
+    def residual(points: Floats) -> Floats:
+        """(2 T + 1, K) of points (6, K) in the optimiser's scale; the last is of the encoder that is not seen."""
+        numbers = points.T * _SCALE
+        found = chain.simulate(numbers, values)
+        missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
+        return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER], axis=1), nan=1e6).T
+
+    starts = values[joint, None]
+    if not again:
+        many = _starts(nominal[joint])
+        starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
+    bounds = [_LOW / _SCALE, _HIGH / _SCALE]
+    ends = [
+        minimize.least_squares(
+            start, residual, bounds, eps=DIFFERENCE, xtol=END, max_iter=STEPS, x_scale="jac", verbose=0
+        )
+        for start in starts / _SCALE
+    ]
+    best = min(ends, key=lambda end: end[1][-1].objective)[0][:, None]
+    error = residual(best)
+    slopes, _ = minimize.jacobian_fd(
+        residual, best, error, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
+    )
+    deviation = _deviation(slopes, error[:, 0])
+    found = best[:, 0] * _SCALE
+    angles = np.stack([angle, *chain.simulate(np.stack([nominal[joint], found]), values)[0]])
+    before, after = np.sqrt(((angles[1:] - angle) ** 2).mean(axis=1)).tolist()
+    return FittedJoint(joint, found, deviation * _SCALE, before, after, sweep.time, angles)
+
+
+def _deviation(slopes: Floats, error: Floats) -> Floats:
+    """Standard deviations (6,) where errors (R,) with ``slopes`` (R, 6) may persist for BLOCK rows [White 1980]."""
+    size = np.linalg.norm(slopes, axis=0)
+    slopes = slopes / size
+    inverse = np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(len(size)))
+    pulls = np.add.reduceat(slopes * error[:, None], np.arange(0, len(error), BLOCK), axis=0)
+    return np.sqrt(np.diag(inverse @ pulls.T @ pulls @ inverse)) / size
+
+
+def _starts(nominal: Floats) -> Floats:
+    """Random starts (TRIES, 6); the scene's armature times a factor."""
+    low, high = np.array([each.start for each in PARAMETERS]).T
+    share = np.random.default_rng(0).random((TRIES, len(PARAMETERS)))
+    starts = low + share * (high - low)
+    starts[:, ARMATURE] *= nominal[ARMATURE]
+    return starts
+
+
+# ---- what is written
+
+
+def table(fit: Fit) -> str:
+    """A line per joint: each number with its standard deviation, and the angle's error before and after."""
+    names = [fit.contract.joints[each.joint] for each in fit.joints]
+    width = max(map(len, names))
+    heads = [f"{each.name} [{each.unit}]" for each in PARAMETERS]
+    lines = ["".join([f"{'joint':<{width}}", *(f"{head:>20}" for head in heads), f"{'error [mrad]':>18}"])]
+    for name, each in zip(names, fit.joints, strict=True):
+        cells = [
+            f"{value:.{p.digits}f} ± {deviation:.{p.digits}f}"
+            for p, value, deviation in zip(PARAMETERS, each.values, each.deviation, strict=True)
+        ]
+        errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f}"
+        lines.append("".join([f"{name:<{width}}", *(f"{cell:>20}" for cell in cells), f"{errors:>18}"]))
+    said = fit.recording.header
+    return "\n".join([*lines, f"{said['task']}, {said['robot']}, {said['began']}; fitted in {fit.seconds:.0f} s"])
+
+
+def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
+    """Fields of the task's config: the numbers of each kind of joint, and ranges that hold each joint's own.
+
+    A range is two standard deviations wider on each side.
+    """
+    values, deviation = fit.values, fit.deviation
+    kinds = _kinds([fit.contract.joints[each.joint] for each in fit.joints])
+    tables, ranges = dict[str, dict[str, float]](), dict[str, list[float]]()
+    for field, column in (("armature", ARMATURE), ("frictionloss", FRICTION)):
+        found, off = values[:, column], deviation[:, column]
+        tables[field] = {kind: _short(found[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
+        mean = np.maximum([tables[field][kind] for kind in kinds], 1e-6)
+        ranges[field] = _range(found / mean, off / mean, 1e-3)
+    ranges["stiffness"] = _range(values[:, GAIN], deviation[:, GAIN], 1e-3)
+    own = fit.contract.damping[[each.joint for each in fit.joints]]
+    if own.all():
+        damping = values[:, GAIN] + values[:, DAMPING] / own
+        ranges["damping"] = _range(damping, deviation[:, GAIN] + deviation[:, DAMPING] / own, 1e-3)
+    ranges["encoder_offset"] = _range(values[:, OFFSET], deviation[:, OFFSET], -1.0)
+    ranges["delay_ms"] = _range(values[:, DELAY], deviation[:, DELAY], 0.0)
+    return {"asset": tables, "domain_rand": {"enable": True, **ranges}}
+
+
+def _kinds(joints: Sequence[str]) -> list[str]:
+    """The part of each name that a joint shares with those of other sides: hip_joint of FL_hip_joint."""
+    rests = [name.partition("_")[2] for name in joints]
+    return [rest if rest and rests.count(rest) > 1 else name for name, rest in zip(joints, rests, strict=True)]
+
+
+def _range(values: Floats, deviation: Floats, least: float) -> list[float]:
+    low, high = float((values - 2.0 * deviation).min()), float((values + 2.0 * deviation).max())
+    return [_short(max(least, low)), _short(high)]
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+LINES = {"measured": "0.6", "by the scene's numbers": "C1", "fitted": "C0"}
+
+
+def draw(fit: Fit, path: Path) -> None:
+    """Write the picture: each joint as measured, with the scene's numbers and with the fitted ones."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserError("drawing a fit needs matplotlib: pip install matplotlib") from None
+    columns = 3
+    count = -(-len(fit.joints) // columns)
+    figure = Figure((15, 2.4 * count + 0.5), layout="constrained")
+    for i, each in enumerate(fit.joints):
+        axes = figure.add_subplot(count, columns, i + 1)
+        for angles, (label, colour) in zip(each.angles, LINES.items(), strict=True):
+            axes.plot(each.time, angles, color=colour, label=label, linewidth=0.9)
+        errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f} mrad"
+        axes.set_title(f"{fit.contract.joints[each.joint]}: {errors}", fontsize=8)
+        axes.tick_params(labelsize=6)
+    figure.axes[0].legend(fontsize=6)
+    figure.supxlabel("[s]", fontsize=8)
+    figure.supylabel("[rad]", fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def parse() -> argparse.Namespace:
+    parser = Parser(prog="legged-mw fit", description=__doc__, allow_abbrev=False)
+    parser.add_argument("log", metavar="LOG", help="of legged-mw deploy EXPORT --chirp ...")
+    parser.add_argument("--joint", action="append", default=[], metavar="NAME", help="only this one; again for more")
+    return parser.parse_args()
+
+
+def main() -> None:
+    args = parse()
+    path = typed(args.log)
+    fit = fit_log(path, args.joint)
+    picture, fields = path.with_suffix(".png"), path.with_suffix(".yaml")
+    print(table(fit))
+    try:
+        draw(fit, picture)
+        save_yaml(fields, overrides(fit))
+    except OSError as error:
+        raise UserError(f"cannot write beside {shown(path)}: {error.strerror}; move the log") from None
+    print(f"written to {shown(picture)} and {shown(fields)}; train with what was fitted:")
+    print(f"legged-mw train --task {fit.contract.task} --override {shown(fields)}")
