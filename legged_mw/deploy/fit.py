@@ -21,7 +21,7 @@ import numpy as np
 from mujoco import minimize
 from mujoco.rollout import Rollout
 
-from legged_mw.deploy.chirp import REST, SLOWEST
+from legged_mw.deploy.chirp import REST, SECONDS, SLOWEST
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.log import DriveLog, LogError, read_log
 from legged_mw.deploy.robot import Floats
@@ -39,9 +39,10 @@ SMOOTH = 5  # ours: measurements in a mean of the gyro, before its slope is take
 ENCODER = 0.01  # [rad] ours: how far an encoder is off, where gravity does not show it
 TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
 BLOCK = 50  # ours: measurements in a row whose errors may be alike
+NOISE = 1.5  # ours: a residual so small is noise, and no other start is followed
 STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: of the optimiser, in the scale of each number
 SLOW = 0.005  # [s] ours: a log of slower measurements shows neither delay nor armature
-SHORT = 0.9  # [share] ours: of the longest sweep; a shorter one is cut off
+SHORT = 0.9  # [share] ours: of a sweep; a shorter one is cut off
 MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.95  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
 
 
@@ -135,18 +136,15 @@ def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
     for name in joints:
         if name not in contract.joints:
             raise UserError(f"--joint: {unknown('joint', name, contract.joints, shown(path))}")
-    sweeps = read_sweeps(path, recording, contract, scene.model)
+    wanted = [name for name in contract.joints if name in joints or not joints]
+    sweeps = read_sweeps(path, recording, contract, scene.model, wanted)
     model, dofs = scene.model, scene.dofs
     nominal = np.zeros((len(dofs), len(PARAMETERS)))
     nominal[:, ARMATURE], nominal[:, FRICTION] = model.dof_armature[dofs], model.dof_frictionloss[dofs]
     nominal[:, GAIN] = 1.0
     values, fitted = nominal.copy(), list[FittedJoint]()
     for turn in range(2):
-        fitted = [
-            _fit_joint(Chain(scene.spec, contract, sweep), values, nominal, turn > 0)
-            for sweep in sweeps
-            if not joints or contract.joints[sweep.joint] in joints
-        ]
+        fitted = [_fit_joint(Chain(scene.spec, contract, sweep), values, nominal, turn > 0) for sweep in sweeps]
         for each in fitted:
             values[each.joint] = each.values
     for each in fitted:
@@ -154,33 +152,37 @@ def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
     return Fit(contract, recording, nominal, fitted, time.monotonic() - began)
 
 
-def read_sweeps(path: Path, recording: DriveLog, contract: Contract, model: mujoco.MjModel) -> list[Sweep]:
-    """The sweeps of all joints. Raises LogError for a log without them, or of a joint that cannot be fitted."""
+def read_sweeps(
+    path: Path, recording: DriveLog, contract: Contract, model: mujoco.MjModel, joints: Sequence[str]
+) -> list[Sweep]:
+    """The sweeps of ``joints``. Raises LogError for a log without them, or if one cannot be fitted."""
     on = recording.rows["state"][:, 0] == STATES.index(CHIRP)
     rows = {name: values[on].astype(float) for name, values in recording.rows.items()}
-    if not on.any() or rows["joint_pos"].shape[1] != len(contract.joints):
-        raise LogError(f"{shown(path)} holds no chirp: record one with legged-mw deploy EXPORT --chirp ...")
+    if not on.any():
+        raise LogError(f"{shown(path)} holds no chirp: record one with legged-mw deploy EXPORT --robot unitree --chirp")
+    if (count := rows["joint_pos"].shape[1]) != len(contract.joints):
+        raise LogError(
+            f"{shown(path)} is of a robot with {count} joints, and its export of one with {len(contract.joints)}"
+        )
     step = float(np.median(np.diff(rows["time"][:, 0])))
     if not 0.0 < step <= SLOW:
         raise LogError(
-            f"{shown(path)} has a measurement each {1e3 * step:.0f} ms, and a fit needs one each {1e3 * SLOW:.0f}"
+            f"{shown(path)} has a measurement each {1e3 * step:.0f} ms; a fit needs one each {1e3 * SLOW:.0f} ms, as --chirp logs"
         )
     moved = np.abs(rows["target"] - contract.default_pose) > 1e-5
     still = np.flatnonzero(~moved.any(axis=1))
     moved[: still[0] if len(still) else len(moved)] = False  # on the way to the pose
-    spans = [np.flatnonzero(column) for column in moved.T]
-    lengths = np.array([each[-1] - each[0] if len(each) else 0 for each in spans])
-    if (short := lengths < SHORT * max(1, lengths.max())).any():
-        first = int(np.argmax(short))
-        raise LogError(
-            f"{shown(path)} ends before the sweep of {contract.joints[first]} does, joint {first + 1} of {len(spans)}: "
-            "record the chirp again"
-        )
-    rest = round(REST / step)
-    parts = [{n: v[max(0, span[0] - rest) : span[-1] + rest] for n, v in rows.items()} for span in spans]
-    for joint, part in enumerate(parts):
-        _check_joint(path, contract.joints[joint], joint, part, step)
-    return [_sweep(joint, part, contract, model, step) for joint, part in enumerate(parts)]
+    spans = {name: np.flatnonzero(moved[:, contract.joints.index(name)]) for name in joints}
+    whole = SECONDS / len(contract.joints) - 2 * REST  # [s]
+    sweeps, rest = list[Sweep](), round(REST / step)
+    for name, span in spans.items():
+        if len(span) < 2 or rows["time"][span[-1], 0] - rows["time"][span[0], 0] < SHORT * whole:
+            place = f"joint {contract.joints.index(name) + 1} of {len(contract.joints)}"
+            raise LogError(f"{shown(path)} ends before the sweep of {name} does, {place}: record the chirp again")
+        part = {key: values[max(0, span[0] - rest) : span[-1] + rest] for key, values in rows.items()}
+        _check_joint(path, name, contract.joints.index(name), part, step)
+        sweeps.append(_sweep(contract.joints.index(name), part, contract, model, step))
+    return sweeps
 
 
 def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], step: float) -> None:
@@ -291,7 +293,7 @@ class Chain:
         spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
         models = [self._with(numbers) for numbers in table]
         after, _ = self._rollout.rollout(models, self._data, start, control, control_spec=spec)
-        states = np.concatenate([start[:, None], after[:, :-1]], axis=1)
+        states = np.concatenate([start[:, None], np.asarray(after)[:, :-1]], axis=1)
         angle, speed = states[..., 1 + self.angles[self.own]], states[..., 1 + model.nq + self.dofs[self.own]]
         return angle + table[:, self.own, OFFSET, None], speed
 
@@ -335,20 +337,22 @@ def _fit_joint(chain: Chain, values: Floats, nominal: Floats, again: bool) -> Fi
         numbers = points.T * _SCALE
         found = chain.simulate(numbers, values)
         missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
-        return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER], axis=1), nan=1e6).T
+        return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER * BLOCK**0.5], axis=1), nan=1e6).T
 
     starts = values[joint, None]
     if not again:
         many = _starts(nominal[joint])
         starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
     bounds = [_LOW / _SCALE, _HIGH / _SCALE]
-    ends = [
-        minimize.least_squares(
+    ends = list[tuple[float, Floats]]()
+    for start in starts / _SCALE:
+        end, trace = minimize.least_squares(
             start, residual, bounds, eps=DIFFERENCE, xtol=END, max_iter=STEPS, x_scale="jac", verbose=0
         )
-        for start in starts / _SCALE
-    ]
-    best = min(ends, key=lambda end: end[1][-1].objective)[0][:, None]
+        ends.append((float(trace[-1].objective), end[:, None]))
+        if ends[-1][0] < 0.5 * NOISE**2 * len(measured):
+            break
+    best = min(ends, key=lambda each: each[0])[1]
     error = residual(best)
     slopes, _ = minimize.jacobian_fd(
         residual, best, error, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
