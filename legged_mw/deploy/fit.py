@@ -67,6 +67,7 @@ PARAMETERS = (
     Parameter("offset", "rad", 4, 0.01, -0.2, 0.2, (0.0, 0.0)),
 )
 DELAY, ARMATURE, FRICTION, DAMPING, GAIN, OFFSET = range(len(PARAMETERS))
+LOCKED = np.array([0.0, HEAVY, 0.0, 0.0, 0.0, 0.0])  # the numbers of a joint that does not move
 _SCALE, _LOW, _HIGH = (np.array([getattr(each, name) for each in PARAMETERS]) for name in ("scale", "low", "high"))
 
 
@@ -79,6 +80,7 @@ class Sweep(NamedTuple):
     angle: Floats  # (T, D) [rad]
     speed: Floats  # (T, D) [rad/s]
     root: Floats  # (T, 6) [m/s^2] world frame, [rad/s^2] body frame: of the root, with gravity pulled off
+    spin: Floats  # (3,) [rad/s] body frame: of the root at the begin
     sent: Floats  # (S,) [s] of targets
     target: Floats  # (S, D) [rad]
 
@@ -101,7 +103,6 @@ class Fit:
 
     contract: Contract
     recording: DriveLog
-    nominal: Floats  # (D, 6) numbers of the scene
     joints: list[FittedJoint]
     seconds: float  # [s] that it took
 
@@ -122,7 +123,7 @@ class Fit:
 def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
     """Fit ``joints`` (default: all) of the log. Raises LogError, ContractError.
 
-    Twice: at first held joints are as in the scene, then as they were fitted.
+    Twice: at first the other joints are locked where they are held, then they are as they were fitted.
     """
     began, recording = time.monotonic(), read_log(path)
     with tempfile.TemporaryDirectory() as own:
@@ -142,14 +143,14 @@ def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
     nominal = np.zeros((len(dofs), len(PARAMETERS)))
     nominal[:, ARMATURE], nominal[:, FRICTION] = model.dof_armature[dofs], model.dof_frictionloss[dofs]
     nominal[:, GAIN] = 1.0
-    values, fitted = nominal.copy(), list[FittedJoint]()
+    values, fitted = np.tile(LOCKED, (len(dofs), 1)), list[FittedJoint]()
     for turn in range(2):
         fitted = [_fit_joint(Chain(scene.spec, contract, sweep), values, nominal, turn > 0) for sweep in sweeps]
         for each in fitted:
             values[each.joint] = each.values
     for each in fitted:
         _check_explained(path, contract.joints[each.joint], each)
-    return Fit(contract, recording, nominal, fitted, time.monotonic() - began)
+    return Fit(contract, recording, fitted, time.monotonic() - began)
 
 
 def read_sweeps(
@@ -222,12 +223,14 @@ def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoc
     angle, speed, gyro, felt = (
         np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
     )
-    root = _root_motion(contract, model, gyro, felt, step)
-    return Sweep(joint, round(REST / step), times - times[0], angle, speed, root, sent - times[0], rows["target"])
+    root, spin = _root_motion(contract, model, gyro, felt, step)
+    return Sweep(joint, round(REST / step), times - times[0], angle, speed, root, spin, sent - times[0], rows["target"])
 
 
-def _root_motion(contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: Floats, step: float) -> Floats:
-    """(T, 6) acceleration of the root in a world without gravity, in which it begins level.
+def _root_motion(
+    contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: Floats, step: float
+) -> tuple[Floats, Floats]:
+    """(T, 6) acceleration of the root in a world without gravity, in which it begins level; (3,) its first spin.
 
     ``gyro`` and ``felt`` (T, 3): of the IMU, its frame.
     """
@@ -245,7 +248,7 @@ def _root_motion(contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: 
         mujoco.mju_quat2Mat(rotation, quaternion)
         world[i] = rotation.reshape(3, 3) @ own[i]
         mujoco.mju_quatIntegrate(quaternion, omega[i], step)
-    return np.concatenate([world, turning], axis=1)
+    return np.concatenate([world, turning], axis=1), omega[0]
 
 
 # ---- the replay
@@ -281,6 +284,7 @@ class Chain:
         control[:, :, model.nu : model.nu + 6] = HEAVY * sweep.root
         start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         start[:, 4] = 1.0  # time, place, attitude
+        start[:, 4 + model.nq : 7 + model.nq] = sweep.spin
         speeds = sweep.speed[: sweep.rest, self.all].mean(axis=0)
         middle = sweep.angle[: sweep.rest, self.all].mean(axis=0) - table[:, :, OFFSET]
         start[:, 1 + self.angles] = middle - speeds * sweep.time[: sweep.rest].mean()
@@ -337,7 +341,7 @@ def _fit_joint(chain: Chain, values: Floats, nominal: Floats, again: bool) -> Fi
         numbers = points.T * _SCALE
         found = chain.simulate(numbers, values)
         missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
-        return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER * BLOCK**0.5], axis=1), nan=1e6).T
+        return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER], axis=1), nan=1e6).T
 
     starts = values[joint, None]
     if not again:
