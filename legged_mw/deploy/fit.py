@@ -28,10 +28,10 @@ from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHIRP, STATES
 from legged_mw.utils.cli import Parser
+from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import typed
 from legged_mw.utils.machine import usable_cores
-from legged_mw.utils.yaml_file import save_yaml
 
 ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
 HEAVY = 1e6  # [kg], [kg m^2] ours: of a root that moves as it is told
@@ -43,7 +43,7 @@ NOISE = 1.5  # ours: a residual so small is noise, and no other start is followe
 STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: of the optimiser, in the scale of each number
 SLOW = 0.005  # [s] ours: a log of slower measurements shows neither delay nor armature
 SHORT = 0.9  # [share] ours: of a sweep; a shorter one is cut off
-MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.95  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
+MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.99  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
 
 
 class Parameter(NamedTuple):

@@ -20,9 +20,9 @@ from legged_mw import ROOT
 from legged_mw.deploy import __main__, replay
 from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.controller import Controller, Network
+from legged_mw.deploy.fit import fit_log
 from legged_mw.deploy.inputs import Gamepad, StopFile
 from legged_mw.deploy.joint_check import JointCheck
-from legged_mw.deploy.fit import fit_log
 from legged_mw.deploy.log import Log, read_log
 from legged_mw.deploy.mirror import RobotMonitor
 from legged_mw.deploy.robot import Robot
