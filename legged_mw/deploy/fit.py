@@ -1,7 +1,7 @@
 """A robot's own numbers from the log of its chirp: delay, armature, friction, damping, gain and encoder offset a joint.
 
-Each joint's sweep is replayed in MuJoCo's C engine with the rest of its leg or arm. The root and gravity move as the
-IMU felt them, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers with which angles
+Each joint's sweep is replayed in MuJoCo's C engine with what hangs on it. The root moves as the IMU felt it, and the
+other joints as they were measured, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers with which angles
 and speeds are nearest to those measured.
 """
 
@@ -34,8 +34,8 @@ from legged_mw.utils.files import typed
 from legged_mw.utils.machine import usable_cores
 
 ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
-HEAVY = 1e6  # [kg], [kg m^2] ours: of a root that moves as it is told
-SMOOTH = 5  # ours: measurements in a mean of the gyro, before its slope is taken
+HEAVY = 1e6  # [kg], [kg m^2] ours: of a root and of joints that move as they are told
+SMOOTH = 9  # ours: measurements in a mean of a speed, before its slope is taken
 ENCODER = 0.01  # [rad] ours: how far an encoder is off, where gravity does not show it
 TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
 BLOCK = 50  # ours: measurements in a row whose errors may be alike
@@ -67,7 +67,6 @@ PARAMETERS = (
     Parameter("offset", "rad", 4, 0.01, -0.2, 0.2, (0.0, 0.0)),
 )
 DELAY, ARMATURE, FRICTION, DAMPING, GAIN, OFFSET = range(len(PARAMETERS))
-LOCKED = np.array([0.0, HEAVY, 0.0, 0.0, 0.0, 0.0])  # the numbers of a joint that does not move
 _SCALE, _LOW, _HIGH = (np.array([getattr(each, name) for each in PARAMETERS]) for name in ("scale", "low", "high"))
 
 
@@ -79,10 +78,10 @@ class Sweep(NamedTuple):
     time: Floats  # (T,) [s] of measurements
     angle: Floats  # (T, D) [rad]
     speed: Floats  # (T, D) [rad/s]
-    root: Floats  # (T, 6) [m/s^2] world frame, [rad/s^2] body frame: of the root, with gravity pulled off
-    spin: Floats  # (3,) [rad/s] body frame: of the root at the begin
+    slope: Floats  # (T, 6 + D) acceleration of the root in a world without gravity, and of the joints
+    spin: Floats  # (6 + D,) their speeds at the begin
     sent: Floats  # (S,) [s] of targets
-    target: Floats  # (S, D) [rad]
+    target: Floats  # (S,) [rad]
 
 
 class FittedJoint(NamedTuple):
@@ -120,10 +119,10 @@ class Fit:
 # ---- the log
 
 
-def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
-    """Fit ``joints`` (default: all) of the log. Raises LogError, ContractError.
+def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = ()) -> Fit:
+    """Fit ``joints`` (default: all) of the log, but those whose names have a part of ``leave_out``.
 
-    Twice: at first the other joints are locked where they are held, then they are as they were fitted.
+    Raises LogError, ContractError.
     """
     began, recording = time.monotonic(), read_log(path)
     with tempfile.TemporaryDirectory() as own:
@@ -134,20 +133,12 @@ def fit_log(path: Path, joints: Sequence[str] = ()) -> Fit:
         if contract.digest != recording.header["network"]:
             raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)}")
         scene = read_scene(folder, contract)
-    for name in joints:
-        if name not in contract.joints:
-            raise UserError(f"--joint: {unknown('joint', name, contract.joints, shown(path))}")
-    wanted = [name for name in contract.joints if name in joints or not joints]
+    for part in leave_out:
+        if not any(part in name for name in contract.joints):
+            raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
+    wanted = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
     sweeps = read_sweeps(path, recording, contract, scene.model, wanted)
-    model, dofs = scene.model, scene.dofs
-    nominal = np.zeros((len(dofs), len(PARAMETERS)))
-    nominal[:, ARMATURE], nominal[:, FRICTION] = model.dof_armature[dofs], model.dof_frictionloss[dofs]
-    nominal[:, GAIN] = 1.0
-    values, fitted = np.tile(LOCKED, (len(dofs), 1)), list[FittedJoint]()
-    for turn in range(2):
-        fitted = [_fit_joint(Chain(scene.spec, contract, sweep), values, nominal, turn > 0) for sweep in sweeps]
-        for each in fitted:
-            values[each.joint] = each.values
+    fitted = [_fit_joint(Chain(scene.spec, contract, sweep)) for sweep in sweeps]
     for each in fitted:
         _check_explained(path, contract.joints[each.joint], each)
     return Fit(contract, recording, fitted, time.monotonic() - began)
@@ -208,8 +199,8 @@ def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
     explained = 1.0 - fitted.after**2 / float(fitted.angles[0].var())
     if explained < EXPLAINED:
         raise LogError(
-            f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.0%} of its motion; "
-            "it is loose, touches something, or is not this robot's"
+            f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.1%} of its motion: it is loose, "
+            f"touches something, or carries the robot; --leave_out {name} fits the others"
         )
 
 
@@ -223,8 +214,17 @@ def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoc
     angle, speed, gyro, felt = (
         np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
     )
-    root, spin = _root_motion(contract, model, gyro, felt, step)
-    return Sweep(joint, round(REST / step), times - times[0], angle, speed, root, spin, sent - times[0], rows["target"])
+    root, turn = _root_motion(contract, model, _even(gyro), felt, step)
+    slope = np.concatenate([root, np.gradient(_even(speed), step, axis=0)], axis=1)
+    spin = np.concatenate([np.zeros(3), turn, _even(speed)[0]])
+    target = rows["target"][:, joint]
+    return Sweep(joint, round(REST / step), times - times[0], angle, speed, slope, spin, sent - times[0], target)
+
+
+def _even(values: Floats) -> Floats:
+    """Means over SMOOTH rows of (T, K)."""
+    padded, window = np.pad(values, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
+    return np.stack([np.convolve(column, window, "valid") for column in padded.T], axis=1)
 
 
 def _root_motion(
@@ -232,15 +232,14 @@ def _root_motion(
 ) -> tuple[Floats, Floats]:
     """(T, 6) acceleration of the root in a world without gravity, in which it begins level; (3,) its first spin.
 
-    ``gyro`` and ``felt`` (T, 3): of the IMU, its frame.
+    ``gyro`` and ``felt`` (T, 3): of the IMU, its frame. Linear in the world frame, angular in the body's.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     mujoco.mj_kinematics(model, data)
     place, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
-    even, window = np.pad(gyro @ turn.T, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
-    omega = np.stack([np.convolve(column, window, "valid") for column in even.T], axis=1)
+    omega = gyro @ turn.T
     turning = np.gradient(omega, step, axis=0)
     own = felt @ turn.T - np.cross(turning, place) - np.cross(omega, np.cross(omega, place))
     quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(own)
@@ -255,60 +254,58 @@ def _root_motion(
 
 
 class Chain:
-    """The leg or arm of a sweep's joint on a root that moves as it is told, in MuJoCo."""
+    """A sweep's joint in MuJoCo, with what hangs on it and what it hangs on."""
 
     def __init__(self, spec: mujoco.MjSpec, contract: Contract, sweep: Sweep) -> None:
-        self.sweep = sweep
-        self.model = model = _only_chain(spec, contract.joints[sweep.joint])
-        self.all = [i for i, name in enumerate(contract.joints) if _has_joint(model, name)]  # in the contract
-        self.own = self.all.index(sweep.joint)
-        joints = [model.joint(contract.joints[i]) for i in self.all]
-        self.dofs = np.array([joint.dofadr[0] for joint in joints])
-        self.angles = np.array([joint.qposadr[0] for joint in joints])
-        self.actuators = np.array([model.actuator(contract.joints[i]).id for i in self.all])
-        self.stiffness, self.damping = contract.stiffness[self.all], contract.damping[self.all]
-        model.opt.timestep, model.opt.integrator = np.diff(sweep.time[:2])[0], mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        name = contract.joints[sweep.joint]
+        self.sweep, self.model = sweep, (model := _only_chain(spec, name))
+        self._gains = np.array([contract.stiffness[sweep.joint], contract.damping[sweep.joint]])
+        self._all = [i for i, each in enumerate(contract.joints) if _has_joint(model, each)]  # in the contract
+        self._dofs = np.array([model.joint(contract.joints[i]).dofadr[0] for i in self._all])
+        self._angles = np.array([model.joint(contract.joints[i]).qposadr[0] for i in self._all])
+        joint, self._actuator = model.joint(name), model.actuator(name).id
+        self._dof, self._angle = int(joint.dofadr[0]), int(joint.qposadr[0])
+        own = [0.0, model.dof_armature[self._dof], model.dof_frictionloss[self._dof], 0.0, 1.0, 0.0]
+        self.nominal: Floats = np.array(own)  # (6,) the scene's
+        model.opt.timestep, model.opt.integrator = sweep.time[1], mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.iterations, model.opt.ls_iterations, model.opt.gravity[:] = 100, 50, 0.0
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        model.dof_armature[:6], model.actuator_ctrllimited[:] = HEAVY, 0
-        model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
+        model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = HEAVY, 0.0, 0.0
+        model.actuator_ctrllimited[:], model.actuator_biastype[:] = 0, mujoco.mjtBias.mjBIAS_AFFINE
+        model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
         threads = usable_cores()
         self._rollout, self._data = Rollout(nthread=threads), [mujoco.MjData(model) for _ in range(threads)]
 
-    def simulate(self, values: Floats, others: Floats) -> tuple[Floats, Floats]:
-        """What the joint's encoder says, angles and speeds (K, T), with ``values`` (K, 6) and all joints' (D, 6)."""
-        table = np.repeat(others[None, self.all], len(values), axis=0)  # (K, J, 6)
-        table[:, self.own] = values
-        sweep, model = self.sweep, self.model
+    def simulate(self, values: Floats) -> tuple[Floats, Floats]:
+        """What the joint's encoder says, angles and speeds (K, T), with ``values`` (K, 6)."""
+        sweep, model, told = self.sweep, self.model, [*range(6), *(6 + i for i in self._all)]
         control = np.zeros((len(values), len(sweep.time), model.nu + model.nv))
-        control[:, :, model.nu : model.nu + 6] = HEAVY * sweep.root
+        pushed = [model.nu + dof for dof in (*range(6), *self._dofs)]
+        control[:, :, pushed] = HEAVY * sweep.slope[:, told]
+        control[:, :, model.nu + self._dof] = 0.0
         start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
-        start[:, 4] = 1.0  # time, place, attitude
-        start[:, 4 + model.nq : 7 + model.nq] = sweep.spin
-        speeds = sweep.speed[: sweep.rest, self.all].mean(axis=0)
-        middle = sweep.angle[: sweep.rest, self.all].mean(axis=0) - table[:, :, OFFSET]
-        start[:, 1 + self.angles] = middle - speeds * sweep.time[: sweep.rest].mean()
-        start[:, 1 + model.nq + self.dofs] = speeds
-        for k, numbers in enumerate(table):
-            for i, actuator in enumerate(self.actuators):
-                when = sweep.time - numbers[i, DELAY] / 1000.0
-                targets = np.interp(when, sweep.sent, sweep.target[:, self.all[i]])
-                control[k, :, actuator] = targets - numbers[i, OFFSET]
+        start[:, 4], qvel = 1.0, 1 + model.nq  # after the time: place, attitude, angles, speeds
+        start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[told]
+        start[:, 1 + self._angles] = sweep.angle[: sweep.rest, self._all].mean(axis=0)
+        speed = sweep.speed[: sweep.rest, sweep.joint].mean()
+        start[:, qvel + self._dof] = speed
+        start[:, 1 + self._angle] -= speed * sweep.time[: sweep.rest].mean() + values[:, OFFSET]
+        for k, numbers in enumerate(values):
+            targets = np.interp(sweep.time - numbers[DELAY] / 1000.0, sweep.sent, sweep.target)
+            control[k, :, self._actuator] = targets - numbers[OFFSET]
         spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
-        models = [self._with(numbers) for numbers in table]
+        models = [self._with(numbers) for numbers in values]
         after, _ = self._rollout.rollout(models, self._data, start, control, control_spec=spec)
         states = np.concatenate([start[:, None], np.asarray(after)[:, :-1]], axis=1)
-        angle, speed = states[..., 1 + self.angles[self.own]], states[..., 1 + model.nq + self.dofs[self.own]]
-        return angle + table[:, self.own, OFFSET, None], speed
+        return states[..., 1 + self._angle] + values[:, OFFSET:], states[..., qvel + self._dof]
 
     def _with(self, numbers: Floats) -> mujoco.MjModel:
-        """The model with the numbers (J, 6) of its joints."""
-        model, servo = copy.copy(self.model), self.actuators
-        model.dof_armature[self.dofs], model.dof_frictionloss[self.dofs] = numbers[:, ARMATURE], numbers[:, FRICTION]
-        model.dof_damping[self.dofs] = numbers[:, DAMPING]
-        stiffness, damping = numbers[:, GAIN] * self.stiffness, numbers[:, GAIN] * self.damping
-        model.actuator_gainprm[servo, 0] = stiffness
-        model.actuator_biasprm[servo, :3] = np.stack([np.zeros_like(stiffness), -stiffness, -damping], axis=1)
+        """The model with the numbers (6,) of its joint."""
+        model, (stiffness, damping) = copy.copy(self.model), numbers[GAIN] * self._gains
+        model.dof_armature[self._dof], model.dof_frictionloss[self._dof] = numbers[ARMATURE], numbers[FRICTION]
+        model.dof_damping[self._dof] = numbers[DAMPING]
+        model.actuator_gainprm[self._actuator, 0] = stiffness
+        model.actuator_biasprm[self._actuator, 1:3] = -stiffness, -damping
         return model
 
 
@@ -317,12 +314,13 @@ def _has_joint(model: mujoco.MjModel, name: str) -> bool:
 
 
 def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
-    """The robot without the legs and arms that ``joint`` is not in; a root that moves as it is told parts them."""
+    """The robot without the bodies that neither hang on ``joint`` nor carry it; they do not move it."""
     spec = spec.copy()
-    root, own = spec.worldbody.first_body(), spec.joint(joint).parent
-    while own.parent.name != root.name:
-        own = own.parent
-    for each in [*spec.sensors, *spec.keys, *[body for body in root.bodies if body.name != own.name]]:
+    body, aside = spec.joint(joint).parent, list[Any]()
+    while (parent := body.parent).name != spec.worldbody.name:
+        aside += [each for each in parent.bodies if each.name != body.name]
+        body = parent
+    for each in [*spec.sensors, *spec.keys, *aside]:
         spec.delete(each)
     return spec.compile()
 
@@ -330,8 +328,8 @@ def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
 # ---- the fit of a joint
 
 
-def _fit_joint(chain: Chain, values: Floats, nominal: Floats, again: bool) -> FittedJoint:
-    """Fit one joint among joints with ``values`` (D, 6): from random starts, or ``again`` from its own values."""
+def _fit_joint(chain: Chain) -> FittedJoint:
+    """Fit one joint from the best of random starts."""
     sweep, joint = chain.sweep, chain.sweep.joint
     angle, speed = sweep.angle[:, joint], sweep.speed[:, joint]
     measured = np.concatenate([angle / ANGLE, speed / SPEED])
@@ -339,14 +337,12 @@ def _fit_joint(chain: Chain, values: Floats, nominal: Floats, again: bool) -> Fi
     def residual(points: Floats) -> Floats:
         """(2 T + 1, K) of points (6, K) in the optimiser's scale; the last is of the encoder that is not seen."""
         numbers = points.T * _SCALE
-        found = chain.simulate(numbers, values)
+        found = chain.simulate(numbers)
         missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
         return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER], axis=1), nan=1e6).T
 
-    starts = values[joint, None]
-    if not again:
-        many = _starts(nominal[joint])
-        starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
+    many = _starts(chain.nominal)
+    starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
     bounds = [_LOW / _SCALE, _HIGH / _SCALE]
     ends = list[tuple[float, Floats]]()
     for start in starts / _SCALE:
@@ -363,7 +359,7 @@ def _fit_joint(chain: Chain, values: Floats, nominal: Floats, again: bool) -> Fi
     )
     deviation = _deviation(slopes, error[:, 0])
     found = best[:, 0] * _SCALE
-    angles = np.stack([angle, *chain.simulate(np.stack([nominal[joint], found]), values)[0]])
+    angles = np.stack([angle, *chain.simulate(np.stack([chain.nominal, found]))[0]])
     before, after = np.sqrt(((angles[1:] - angle) ** 2).mean(axis=1)).tolist()
     return FittedJoint(joint, found, deviation * _SCALE, before, after, sweep.time, angles)
 
@@ -472,14 +468,15 @@ def draw(fit: Fit, path: Path) -> None:
 def parse() -> argparse.Namespace:
     parser = Parser(prog="legged-mw fit", description=__doc__, allow_abbrev=False)
     parser.add_argument("log", metavar="LOG", help="of legged-mw deploy EXPORT --chirp ...")
-    parser.add_argument("--joint", action="append", default=[], metavar="NAME", help="only this one; again for more")
+    out = "joints with this in their names are not fitted; again for more"
+    parser.add_argument("--leave_out", action="append", default=[], metavar="NAME", help=out)
     return parser.parse_args()
 
 
 def main() -> None:
     args = parse()
     path = typed(args.log)
-    fit = fit_log(path, args.joint)
+    fit = fit_log(path, leave_out=args.leave_out)
     picture, fields = path.with_suffix(".png"), path.with_suffix(".yaml")
     print(table(fit))
     try:
