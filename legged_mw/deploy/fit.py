@@ -36,7 +36,7 @@ from legged_mw.utils.machine import usable_cores
 ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
 HEAVY = 1e6  # [kg], [kg m^2] ours: of a root and of joints that move as they are told
 SMOOTH = 9  # ours: measurements in a mean of a speed, before its slope is taken
-ENCODER = 0.01  # [rad] ours: how far an encoder is off, where gravity does not show it
+EXPECTED = (0.1, 0.01)  # [-], [rad] ours: how far gain and encoder are off where nothing shows it; two more errors
 TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
 BLOCK = 50  # ours: measurements in a row whose errors may be alike
 NOISE = 1.5  # ours: a residual so small is noise, and no other start is followed
@@ -335,11 +335,12 @@ def _fit_joint(chain: Chain) -> FittedJoint:
     measured = np.concatenate([angle / ANGLE, speed / SPEED])
 
     def residual(points: Floats) -> Floats:
-        """(2 T + 1, K) of points (6, K) in the optimiser's scale; the last is of the encoder that is not seen."""
+        """(2 T + 2, K) of points (6, K) in the optimiser's scale; the last two, by EXPECTED, count as BLOCK each."""
         numbers = points.T * _SCALE
         found = chain.simulate(numbers)
         missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
-        return np.nan_to_num(np.concatenate([missed, numbers[:, OFFSET:] / ENCODER], axis=1), nan=1e6).T
+        off = (numbers[:, GAIN:] - [1.0, 0.0]) / EXPECTED * BLOCK**0.5
+        return np.nan_to_num(np.concatenate([missed, off], axis=1), nan=1e6).T
 
     many = _starts(chain.nominal)
     starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
@@ -365,12 +366,11 @@ def _fit_joint(chain: Chain) -> FittedJoint:
 
 
 def _deviation(slopes: Floats, error: Floats) -> Floats:
-    """Standard deviations (6,) where errors (R,) with ``slopes`` (R, 6) may persist for BLOCK rows [White 1980]."""
+    """Standard deviations (6,) by errors (R,) and their ``slopes`` (R, 6), as if BLOCK rows in a row had one error."""
     size = np.linalg.norm(slopes, axis=0)
     slopes = slopes / size
-    inverse = np.linalg.inv(slopes.T @ slopes + 1e-9 * np.eye(len(size)))
-    pulls = np.add.reduceat(slopes * error[:, None], np.arange(0, len(error), BLOCK), axis=0)
-    return np.sqrt(np.diag(inverse @ pulls.T @ pulls @ inverse)) / size
+    variance = BLOCK * float(error @ error) / (len(error) - len(size))
+    return np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes))) / size
 
 
 def _starts(nominal: Floats) -> Floats:
