@@ -440,7 +440,7 @@ def _short(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-LINES = {"measured": "0.6", "by the scene's numbers": "C1", "fitted": "C0"}
+LINES = {"measured": ("0.75", 3.0), "by the scene's numbers": ("C1", 0.9), "fitted": ("C0", 0.9)}  # colour, width
 
 
 def draw(fit: Fit, path: Path) -> None:
@@ -454,8 +454,8 @@ def draw(fit: Fit, path: Path) -> None:
     figure = Figure((15, 2.4 * count + 0.5), layout="constrained")
     for i, each in enumerate(fit.joints):
         axes = figure.add_subplot(count, columns, i + 1)
-        for angles, (label, colour) in zip(each.angles, LINES.items(), strict=True):
-            axes.plot(each.time, angles, color=colour, label=label, linewidth=0.9)
+        for angles, (label, (colour, width)) in zip(each.angles, LINES.items(), strict=True):
+            axes.plot(each.time, angles, color=colour, label=label, linewidth=width)
         errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f} mrad"
         axes.set_title(f"{fit.contract.joints[each.joint]}: {errors}", fontsize=8)
         axes.tick_params(labelsize=6)
