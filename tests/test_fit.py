@@ -150,6 +150,14 @@ def test_a_log_that_cannot_be_fitted_is_refused(log: Path, change: Callable[[Dri
         fit.read_sweeps(log, change(recording), CONTRACT, model, [CALF])
 
 
+def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
+    swing = np.sin(np.arange(1000.0))
+    joint = fit.FittedJoint(JOINT, np.zeros(6), np.zeros(6), 0.5, 0.36, np.arange(1000.0), np.stack([swing] * 3))
+    with pytest.raises(LogError, match=r"FL_calf_joint cannot be fitted: the best numbers explain 74.1%"):
+        fit._check_explained(Path("log"), CALF, joint)
+    fit._check_explained(Path("log"), CALF, joint._replace(after=0.05))
+
+
 def test_sweeps_keep_the_contracts_limits() -> None:
     """Within ranges and torques of all joints, also where the contract has no ratings."""
     limits, robot = Limits.of(GO2, CONTRACT), MujocoRobot(GO2, CONTRACT, hoisted=True)

@@ -196,7 +196,7 @@ def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], ste
 
 def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
     """Raise LogError if the best numbers do not replay the joint's motion."""
-    explained = 1.0 - fitted.after**2 / float(fitted.angles[0].var())
+    explained = max(0.0, 1.0 - fitted.after**2 / float(fitted.angles[0].var()))
     if explained < EXPLAINED:
         raise LogError(
             f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.1%} of its motion: it is loose, "
