@@ -1,4 +1,4 @@
-"""The programs: legged-mw train, play, deploy, exam, robot and tools. train.py and play.py of a clone are the first two.
+"""The programs: legged-mw train, play, deploy, exam, fit, robot and tools. train.py and play.py of a clone are the first two.
 
 Each imports what it needs when it starts: deploy also runs where torch is not installed.
 """
@@ -202,6 +202,7 @@ PROGRAMS: dict[str, Callable[[], None]] = {
     "play": play,
     "deploy": deploy,
     "exam": exam,
+    "fit": _tool("legged_mw.deploy.fit"),
     "robot": robot,
     "motion": _tool("legged_mw.motion.__main__"),
     "doctor": _tool("legged_mw.tools.doctor"),
@@ -215,6 +216,7 @@ HELP = """legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help
   play        watch, grade or export a policy
   deploy      run an exported policy without torch
   exam        grade a policy, and compare with an earlier result
+  fit         a robot's own numbers, from the log of its chirp
   robot       a robot's health page, and a first task for it
   motion      read and look at reference motions
   doctor      what this machine has, lacks and how fast it trains

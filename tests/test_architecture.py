@@ -54,7 +54,7 @@ ONLY_IN = {
     "rsl_rl": ["legged_mw/rl/*", "legged_mw/export/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     # a second to import, and only for a report
-    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],
+    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py", "legged_mw/deploy/fit.py"],
     "legged_mw.view": [
         *(
             "legged_mw/view/*",

@@ -43,6 +43,7 @@ WHY_NOT = {
     r"udp_robot": "two programs: test_udp_example.py",
     r"--(robot|serve) |--interface": "a robot on a network: test_unitree_wire.py, test_unitree_robot.py",
     r"--(drive|check_joints|first_walk|replay)\b": "real time: test_deploy_loop, test_joint_check, test_first_walk, test_deploy_log",
+    r"--override logs/deploy|benchmarks\.fit": "from the log of a chirp: test_fit.py",
     r"--eval\b": "an exam takes half a minute: test_exam.py, test_report.py, test_deploy.py, test_skills.py",
     r"--(video|sheet|picture)\b|--play\b": "draws: test_view.py, test_robot_page.py, test_terrain_look.py",
     r"--(teacher|init|resume|load_run|checkpoint|export)\b|deploy (my_policy|out/)": "goes on from a run: test_teacher.py, test_train.py",

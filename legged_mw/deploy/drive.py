@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from legged_mw.deploy.chirp import Chirp, at_rate
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.first_walk import FirstWalk, rehearse
@@ -48,6 +49,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     checked = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
     parser.add_argument("--check_joints", action="store_true", help=checked)
+    swept = (
+        "the joint check, then a sweep of each joint of a hanging robot, whose log legged-mw fit reads (docs/fit.md)"
+    )
+    parser.add_argument("--chirp", action="store_true", help=swept)
     first = "a robot's first walk: joint check, stand, stop, ten steps, a metre, each value beside the exam's robot"
     parser.add_argument("--first_walk", action="store_true", help=first)
     hangs = "a simulated robot hangs until the policy starts (default: if it has two feet), high: its feet in the air, as in --check_joints"
@@ -73,9 +78,11 @@ def check_flags(args: argparse.Namespace) -> None:
     others = [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]
     if args.check_joints and others:
         raise FlagError(f"--check_joints moves one joint of a robot at a time: leave --{others[0]} out")
-    if args.first_walk and (others := others + ["check_joints"] * args.check_joints):
+    if args.chirp and (others := others + ["check_joints"] * args.check_joints):
+        raise FlagError(f"--chirp moves one joint of a robot at a time, after a joint check: leave --{others[0]} out")
+    if args.first_walk and (others := others + [n for n in ("check_joints", "chirp") if getattr(args, n)]):
         raise FlagError(f"--first_walk is a list with commands and a joint check of its own: leave --{others[0]} out")
-    args.drive |= args.check_joints or args.first_walk
+    args.drive |= args.check_joints or args.first_walk or args.chirp
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
     shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
     watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
@@ -96,13 +103,15 @@ def check_flags(args: argparse.Namespace) -> None:
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     """True if a simulated robot begins on a hoist."""
-    checked = args.check_joints or args.first_walk
+    checked = args.check_joints or args.first_walk or args.chirp
     return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or checked))
 
 
 def lift(args: argparse.Namespace) -> float:
     """Height [m] of the hoisted robot above its start."""
-    return LIFT * (args.hoist == "high" or (args.hoist is None and (args.check_joints or args.first_walk)))
+    return LIFT * (
+        args.hoist == "high" or (args.hoist is None and (args.check_joints or args.first_walk or args.chirp))
+    )
 
 
 def drive(
@@ -123,13 +132,18 @@ def drive(
     with ExitStack() as stack:
         stack.callback(robot.close)
         mirror = stack.enter_context(closing(RobotMonitor(folder, contract, args))) if args.viewer in LIVE else None
-        safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
+        limits = Limits.of(folder, contract, robot.limits, parse_limits(args.limit))
+        if args.chirp:
+            contract, limits = at_rate(contract, limits, robot)
+        safety = Safety(contract, limits)
         path = None if args.log == "off" else log_path(contract) if args.log is None else writable(args.log, "--log")
         console = stack.enter_context(DriveConsole(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
         if args.first_walk:
             states = FirstWalk(controller, sources, console.say, robot, safety.limits, rehearse(folder, contract))
+        elif args.chirp:
+            states = Chirp(controller, sources, console.say, robot, safety.limits)
         elif args.check_joints:
             states = JointCheck(controller, sources, console.say, robot, safety.limits)
         else:
@@ -139,7 +153,7 @@ def drive(
         odometry = Odometry(folder, contract, 1, contact) if contact else None
         # last, so that a refused run leaves no log
         log = Log(path, contract, folder, kind, console.say) if path else None
-        console.say(f"{CHECK_KEYS if args.check_joints else KEYS}\n{states.state}: {states.note}")
+        console.say(f"{CHECK_KEYS if args.check_joints or args.chirp else KEYS}\n{states.state}: {states.note}")
         # right before the run, which ends damped at any of them
         stack.enter_context(_ended_by_signals())
 

@@ -93,7 +93,7 @@ class JointCheck(States):
         try:
             return self._moves.send(measured)
         except StopIteration:
-            self._enter(DAMPING, now, "the joint check is over")
+            self._enter(DAMPING, now, f"the {self.state} is over")
             return Order(DAMPING)
 
     def _enter(self, state: str, now: float, note: str) -> None:

@@ -104,6 +104,8 @@ class Robot(ABC):
     motors: Mapping[str, int] = {}  # joint -> number of its motor, if motors have numbers
     # of this machine, which no contract can state: names and units as in safety.Limits
     limits: Mapping[str, float] = {}
+    # [s] between two measurements of a robot that sends them faster than a policy acts, for the chirp
+    step: float | None = None
     report: str = ""  # set by `close`: how the link worked during the run, in words
 
     @abstractmethod

@@ -21,8 +21,11 @@ from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
 
-ZERO, STAND, POLICY, DAMPING, CHECK = STATES = ("zero torque", "stand", "policy", "damping", "joint check")
-ARMED = (STAND, POLICY, CHECK)  # states with limits; in the others no motor pushes
+ZERO, STAND, POLICY, DAMPING, CHECK, CHIRP = STATES = (
+    *("zero torque", "stand", "policy"),
+    *("damping", "joint check", "chirp"),
+)
+ARMED = (STAND, POLICY, CHECK, CHIRP)  # states with limits; in the others no motor pushes
 RISE = 2.0  # [s] of standing up, from any pose to the default pose [unitree_rl_gym]
 SOFT = 0.1  # [share of the stiffness] at the start of standing up
 NEAR = 0.15  # [rad] ours: a joint farther from the pose after RISE carries weight and gets stiffer

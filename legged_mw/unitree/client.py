@@ -22,6 +22,7 @@ from legged_mw.unitree.remote import decode
 from legged_mw.unitree.robots import Machine, check_body, check_slots, machine_of, order
 
 TOO_OLD = 0.1  # [s] ours: an older measurement is not used
+STEP = 0.002  # [s] robots send their state at 500 Hz
 TOUCH = 20  # foot_force of a foot on the ground, in the robot's own unit; ours
 _WRAP = 2**32 / 1000  # [s] after which a robot's tick wraps to 0
 LOST = 5  # ours: messages that a motor may lose between two checks
@@ -75,7 +76,7 @@ class UnitreeRobot(Robot):
     Targets are sent unchanged: ``Safety.held`` clips them to the servos' ranges, for every robot.
     """
 
-    can_change_gains = True
+    can_change_gains, step = True, STEP
 
     def __init__(
         self,

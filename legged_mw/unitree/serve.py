@@ -20,12 +20,12 @@ from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.robot import Floats, damped
 from legged_mw.deploy.safety import limits_of
 from legged_mw.deploy.simulated import read_scene
+from legged_mw.unitree.client import STEP
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.faults import NAN, SWAPS, Faults, Line
 from legged_mw.unitree.remote import encode
 from legged_mw.unitree.robots import Machine, machine_of, order
 
-STEP = 0.002  # [s] robots send their state at 500 Hz
 # in q and dq: no position control, no velocity control [unitree_sdk2]
 POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0
 LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go

@@ -38,6 +38,8 @@ go1_flat --command=0,0,0 --commands a.yaml
 go1_flat --eval --out folder
 go1_flat --check_joints --command=0,0,0
 go1_flat --first_walk --check_joints
+go1_flat --chirp --check_joints
+go1_flat --chirp --log off
 go1_flat --drive --eval
 go1_flat --drive --num_envs 2
 go1_flat --log a

@@ -65,6 +65,7 @@ def table() -> Table:
         "sweep": SWEEP,
         "completion": ["", "fish"],
         "warm": ["--x"],
+        "fit": ["", "nosuch.lmwlog"],
     }.items():
         made.programs(name, lines)
     made.programs("doctor", ["--x"])

@@ -20,6 +20,7 @@ from legged_mw import ROOT
 from legged_mw.deploy import __main__, replay
 from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.controller import Controller, Network
+from legged_mw.deploy.fit import fit_log
 from legged_mw.deploy.inputs import Gamepad, StopFile
 from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, read_log
@@ -268,6 +269,7 @@ def table() -> Table:
         "log: no folder", lambda root: Log(root / "no/a", CONTRACT, GO2_FLAT, ""), lambda root: (root / "no").touch()
     )
     made.add("replay: too short", lambda root: replay.replay(Path("walk.lmwlog"), None), given_log(3.0))
+    made.add("fit: no chirp", lambda root: fit_log(Path("walk.lmwlog")), given_log(3.0))
     made.add(
         "replay: another network",
         lambda root: replay.replay(Path("walk.lmwlog"), ROOT / "resources/policies/go1_flat"),

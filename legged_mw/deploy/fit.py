@@ -1,0 +1,488 @@
+"""A robot's own numbers from the log of its chirp: delay, armature, friction, damping, gain and encoder offset a joint.
+
+Each joint's sweep is replayed in MuJoCo's C engine with what hangs on it. The root moves as the IMU felt it, and the
+other joints as they were measured, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers with which angles
+and speeds are nearest to those measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco import minimize
+from mujoco.rollout import Rollout
+
+from legged_mw.deploy.chirp import REST, SECONDS, SLOWEST
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.log import DriveLog, LogError, read_log
+from legged_mw.deploy.robot import Floats
+from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.states import CHIRP, STATES
+from legged_mw.utils.cli import Parser
+from legged_mw.utils.config import save_yaml
+from legged_mw.utils.errors import UserError, shown, unknown
+from legged_mw.utils.files import typed
+from legged_mw.utils.machine import usable_cores
+
+ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
+HEAVY = 1e6  # [kg], [kg m^2] ours: of a root and of joints that move as they are told
+SMOOTH = 9  # ours: measurements in a mean of a speed, before its slope is taken
+EXPECTED = (0.1, 0.01)  # [-], [rad] ours: how far gain and encoder are off where nothing shows it; two more errors
+TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
+BLOCK = 50  # ours: measurements in a row whose errors may be alike
+NOISE = 1.5  # ours: a residual so small is noise, and no other start is followed
+STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: of the optimiser, in the scale of each number
+SLOW = 0.005  # [s] ours: a log of slower measurements shows neither delay nor armature
+SHORT = 0.9  # [share] ours: of a sweep; a shorter one is cut off
+MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.99  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
+
+
+class Parameter(NamedTuple):
+    """A number that is fitted."""
+
+    name: str
+    unit: str
+    digits: int
+    scale: float  # of a change that matters, for the optimiser
+    low: float
+    high: float
+    start: tuple[float, float]  # of the random starts; of the armature a factor on the scene's
+
+
+PARAMETERS = (
+    Parameter("delay", "ms", 1, 1.0, 0.0, 100.0, (0.0, 30.0)),
+    Parameter("armature", "kg m^2", 4, 0.01, 1e-4, 1.0, (0.4, 8.0)),
+    Parameter("friction", "N m", 3, 0.1, 0.0, 20.0, (0.0, 1.5)),
+    Parameter("damping", "N m s/rad", 3, 0.1, 0.0, 20.0, (0.0, 0.6)),
+    Parameter("gain", "-", 3, 0.1, 0.2, 3.0, (0.7, 1.3)),
+    Parameter("offset", "rad", 4, 0.01, -0.2, 0.2, (0.0, 0.0)),
+)
+DELAY, ARMATURE, FRICTION, DAMPING, GAIN, OFFSET = range(len(PARAMETERS))
+_SCALE, _LOW, _HIGH = (np.array([getattr(each, name) for each in PARAMETERS]) for name in ("scale", "low", "high"))
+
+
+class Sweep(NamedTuple):
+    """One joint's part of a log, at even times."""
+
+    joint: int
+    rest: int  # measurements at rest, at the begin
+    time: Floats  # (T,) [s] of measurements
+    angle: Floats  # (T, D) [rad]
+    speed: Floats  # (T, D) [rad/s]
+    slope: Floats  # (T, 6 + D) acceleration of the root in a world without gravity, and of the joints
+    spin: Floats  # (6 + D,) their speeds at the begin
+    sent: Floats  # (S,) [s] of targets
+    target: Floats  # (S,) [rad]
+
+
+class FittedJoint(NamedTuple):
+    """The numbers of one joint, in the order of PARAMETERS, and how well they replay its sweep."""
+
+    joint: int
+    values: Floats  # (6,)
+    deviation: Floats  # (6,) standard deviation, by the residual and its derivatives
+    before: float  # [rad] RMS of the angle's error with the scene's numbers
+    after: float  # [rad] with the fitted ones
+    time: Floats  # (T,) [s]
+    angles: Floats  # (3, T) [rad] measured, simulated with the scene's numbers, and with the fitted ones
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The fit of one log."""
+
+    contract: Contract
+    recording: DriveLog
+    joints: list[FittedJoint]
+    seconds: float  # [s] that it took
+
+    @property
+    def values(self) -> Floats:
+        """(D, 6)"""
+        return np.array([each.values for each in self.joints])
+
+    @property
+    def deviation(self) -> Floats:
+        """(D, 6)"""
+        return np.array([each.deviation for each in self.joints])
+
+
+# ---- the log
+
+
+def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = ()) -> Fit:
+    """Fit ``joints`` (default: all) of the log, but those whose names have a part of ``leave_out``.
+
+    Raises LogError, ContractError.
+    """
+    began, recording = time.monotonic(), read_log(path)
+    with tempfile.TemporaryDirectory() as own:
+        for name, content in recording.files.items():
+            (Path(own) / name).write_bytes(content)
+        folder = Path(own) if recording.files else Path(recording.header["export"])
+        contract = read_contract(folder)
+        if contract.digest != recording.header["network"]:
+            raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)}")
+        scene = read_scene(folder, contract)
+    for part in leave_out:
+        if not any(part in name for name in contract.joints):
+            raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
+    wanted = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
+    sweeps = read_sweeps(path, recording, contract, scene.model, wanted)
+    fitted = [_fit_joint(Chain(scene.spec, contract, sweep)) for sweep in sweeps]
+    for each in fitted:
+        _check_explained(path, contract.joints[each.joint], each)
+    return Fit(contract, recording, fitted, time.monotonic() - began)
+
+
+def read_sweeps(
+    path: Path, recording: DriveLog, contract: Contract, model: mujoco.MjModel, joints: Sequence[str]
+) -> list[Sweep]:
+    """The sweeps of ``joints``. Raises LogError for a log without them, or if one cannot be fitted."""
+    on = recording.rows["state"][:, 0] == STATES.index(CHIRP)
+    rows = {name: values[on].astype(float) for name, values in recording.rows.items()}
+    if not on.any():
+        raise LogError(f"{shown(path)} holds no chirp: record one with legged-mw deploy EXPORT --robot unitree --chirp")
+    if (count := rows["joint_pos"].shape[1]) != len(contract.joints):
+        raise LogError(
+            f"{shown(path)} is of a robot with {count} joints, and its export of one with {len(contract.joints)}"
+        )
+    step = float(np.median(np.diff(rows["time"][:, 0])))
+    if not 0.0 < step <= SLOW:
+        raise LogError(
+            f"{shown(path)} has a measurement each {1e3 * step:.0f} ms; a fit needs one each {1e3 * SLOW:.0f} ms, as --chirp logs"
+        )
+    moved = np.abs(rows["target"] - contract.default_pose) > 1e-5
+    still = np.flatnonzero(~moved.any(axis=1))
+    moved[: still[0] if len(still) else len(moved)] = False  # on the way to the pose
+    spans = {name: np.flatnonzero(moved[:, contract.joints.index(name)]) for name in joints}
+    whole = SECONDS / len(contract.joints) - 2 * REST  # [s]
+    sweeps, rest = list[Sweep](), round(REST / step)
+    for name, span in spans.items():
+        if len(span) < 2 or rows["time"][span[-1], 0] - rows["time"][span[0], 0] < SHORT * whole:
+            place = f"joint {contract.joints.index(name) + 1} of {len(contract.joints)}"
+            raise LogError(f"{shown(path)} ends before the sweep of {name} does, {place}: record the chirp again")
+        part = {key: values[max(0, span[0] - rest) : span[-1] + rest] for key, values in rows.items()}
+        _check_joint(path, name, contract.joints.index(name), part, step)
+        sweeps.append(_sweep(contract.joints.index(name), part, contract, model, step))
+    return sweeps
+
+
+def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], step: float) -> None:
+    """Raise LogError if the encoder is dead, or the joint does not follow its target."""
+    target, angle, speed = (rows[key][:, joint] for key in ("target", "joint_pos", "joint_vel"))
+    jumps = float(np.abs(np.diff(angle) - step * speed[1:]).max())
+    slow = slice(0, round(1.5 / SLOWEST / step))  # the slowest swings, which each joint can follow
+    went, told = float(np.ptp(angle[slow])), float(np.ptp(target[slow]))
+    if not np.isfinite([angle, speed]).all() or not np.ptp(angle) > 0.0:
+        why = "its encoder is dead: the angle is the same throughout"
+    elif jumps > JUMP:
+        why = f"its encoder jumps by {jumps:.2f} rad between two measurements"
+    elif went < MOVED * told:
+        why = f"it went {went:.2f} rad where its target went {told:.2f}: its motor is loose, or it is blocked"
+    else:
+        return
+    raise LogError(f"{shown(path)}: {name} cannot be fitted: {why}")
+
+
+def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
+    """Raise LogError if the best numbers do not replay the joint's motion."""
+    explained = max(0.0, 1.0 - fitted.after**2 / float(fitted.angles[0].var()))
+    if explained < EXPLAINED:
+        raise LogError(
+            f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.1%} of its motion: it is loose, "
+            f"touches something, or carries the robot; --leave_out {name} fits the others"
+        )
+
+
+def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoco.MjModel, step: float) -> Sweep:
+    """One joint's rows at even times, each at the time when it was measured, or sent."""
+    begins = rows["time"][:, 0] + rows["behind"][:, 0]
+    measured = begins - np.nan_to_num(rows["age"][:, 0])
+    sent = begins + np.append(rows["work"][1:, 0], rows["work"][-1:, 0])  # a row has the work of the step before
+    times = np.arange(measured[0], measured[-1], step)
+    names = ("joint_pos", "joint_vel", "ang_vel", "acceleration")
+    angle, speed, gyro, felt = (
+        np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
+    )
+    root, turn = _root_motion(contract, model, _even(gyro), felt, step)
+    slope = np.concatenate([root, np.gradient(_even(speed), step, axis=0)], axis=1)
+    spin = np.concatenate([np.zeros(3), turn, _even(speed)[0]])
+    target = rows["target"][:, joint]
+    return Sweep(joint, round(REST / step), times - times[0], angle, speed, slope, spin, sent - times[0], target)
+
+
+def _even(values: Floats) -> Floats:
+    """Means over SMOOTH rows of (T, K)."""
+    padded, window = np.pad(values, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
+    return np.stack([np.convolve(column, window, "valid") for column in padded.T], axis=1)
+
+
+def _root_motion(
+    contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: Floats, step: float
+) -> tuple[Floats, Floats]:
+    """(T, 6) acceleration of the root in a world without gravity, in which it begins level; (3,) its first spin.
+
+    ``gyro`` and ``felt`` (T, 3): of the IMU, its frame. Linear in the world frame, angular in the body's.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    mujoco.mj_kinematics(model, data)
+    place, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
+    omega = gyro @ turn.T
+    turning = np.gradient(omega, step, axis=0)
+    own = felt @ turn.T - np.cross(turning, place) - np.cross(omega, np.cross(omega, place))
+    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(own)
+    for i in range(len(own)):
+        mujoco.mju_quat2Mat(rotation, quaternion)
+        world[i] = rotation.reshape(3, 3) @ own[i]
+        mujoco.mju_quatIntegrate(quaternion, omega[i], step)
+    return np.concatenate([world, turning], axis=1), omega[0]
+
+
+# ---- the replay
+
+
+class Chain:
+    """A sweep's joint in MuJoCo, with what hangs on it and what it hangs on."""
+
+    def __init__(self, spec: mujoco.MjSpec, contract: Contract, sweep: Sweep) -> None:
+        name = contract.joints[sweep.joint]
+        self.sweep, self.model = sweep, (model := _only_chain(spec, name))
+        self._gains = np.array([contract.stiffness[sweep.joint], contract.damping[sweep.joint]])
+        self._all = [i for i, each in enumerate(contract.joints) if _has_joint(model, each)]  # in the contract
+        self._dofs = np.array([model.joint(contract.joints[i]).dofadr[0] for i in self._all])
+        self._angles = np.array([model.joint(contract.joints[i]).qposadr[0] for i in self._all])
+        joint, self._actuator = model.joint(name), model.actuator(name).id
+        self._dof, self._angle = int(joint.dofadr[0]), int(joint.qposadr[0])
+        own = [0.0, model.dof_armature[self._dof], model.dof_frictionloss[self._dof], 0.0, 1.0, 0.0]
+        self.nominal: Floats = np.array(own)  # (6,) the scene's
+        model.opt.timestep, model.opt.integrator = sweep.time[1], mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.iterations, model.opt.ls_iterations, model.opt.gravity[:] = 100, 50, 0.0
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = HEAVY, 0.0, 0.0
+        model.actuator_ctrllimited[:], model.actuator_biastype[:] = 0, mujoco.mjtBias.mjBIAS_AFFINE
+        model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
+        threads = usable_cores()
+        self._rollout, self._data = Rollout(nthread=threads), [mujoco.MjData(model) for _ in range(threads)]
+
+    def simulate(self, values: Floats) -> tuple[Floats, Floats]:
+        """What the joint's encoder says, angles and speeds (K, T), with ``values`` (K, 6)."""
+        sweep, model, told = self.sweep, self.model, [*range(6), *(6 + i for i in self._all)]
+        control = np.zeros((len(values), len(sweep.time), model.nu + model.nv))
+        pushed = [model.nu + dof for dof in (*range(6), *self._dofs)]
+        control[:, :, pushed] = HEAVY * sweep.slope[:, told]
+        control[:, :, model.nu + self._dof] = 0.0
+        start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+        start[:, 4], qvel = 1.0, 1 + model.nq  # after the time: place, attitude, angles, speeds
+        start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[told]
+        start[:, 1 + self._angles] = sweep.angle[: sweep.rest, self._all].mean(axis=0)
+        speed = sweep.speed[: sweep.rest, sweep.joint].mean()
+        start[:, qvel + self._dof] = speed
+        start[:, 1 + self._angle] -= speed * sweep.time[: sweep.rest].mean() + values[:, OFFSET]
+        for k, numbers in enumerate(values):
+            targets = np.interp(sweep.time - numbers[DELAY] / 1000.0, sweep.sent, sweep.target)
+            control[k, :, self._actuator] = targets - numbers[OFFSET]
+        spec = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+        models = [self._with(numbers) for numbers in values]
+        after, _ = self._rollout.rollout(models, self._data, start, control, control_spec=spec)
+        states = np.concatenate([start[:, None], np.asarray(after)[:, :-1]], axis=1)
+        return states[..., 1 + self._angle] + values[:, OFFSET:], states[..., qvel + self._dof]
+
+    def _with(self, numbers: Floats) -> mujoco.MjModel:
+        """The model with the numbers (6,) of its joint."""
+        model, (stiffness, damping) = copy.copy(self.model), numbers[GAIN] * self._gains
+        model.dof_armature[self._dof], model.dof_frictionloss[self._dof] = numbers[ARMATURE], numbers[FRICTION]
+        model.dof_damping[self._dof] = numbers[DAMPING]
+        model.actuator_gainprm[self._actuator, 0] = stiffness
+        model.actuator_biasprm[self._actuator, 1:3] = -stiffness, -damping
+        return model
+
+
+def _has_joint(model: mujoco.MjModel, name: str) -> bool:
+    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0
+
+
+def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
+    """The robot without the bodies that neither hang on ``joint`` nor carry it; they do not move it."""
+    spec = spec.copy()
+    body, aside = spec.joint(joint).parent, list[Any]()
+    while (parent := body.parent).name != spec.worldbody.name:
+        aside += [each for each in parent.bodies if each.name != body.name]
+        body = parent
+    for each in [*spec.sensors, *spec.keys, *aside]:
+        spec.delete(each)
+    return spec.compile()
+
+
+# ---- the fit of a joint
+
+
+def _fit_joint(chain: Chain) -> FittedJoint:
+    """Fit one joint from the best of random starts."""
+    sweep, joint = chain.sweep, chain.sweep.joint
+    angle, speed = sweep.angle[:, joint], sweep.speed[:, joint]
+    measured = np.concatenate([angle / ANGLE, speed / SPEED])
+
+    def residual(points: Floats) -> Floats:
+        """(2 T + 2, K) of points (6, K) in the optimiser's scale; the last two, by EXPECTED, count as BLOCK each."""
+        numbers = points.T * _SCALE
+        found = chain.simulate(numbers)
+        missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
+        off = (numbers[:, GAIN:] - [1.0, 0.0]) / EXPECTED * BLOCK**0.5
+        return np.nan_to_num(np.concatenate([missed, off], axis=1), nan=1e6).T
+
+    many = _starts(chain.nominal)
+    starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
+    bounds = [_LOW / _SCALE, _HIGH / _SCALE]
+    ends = list[tuple[float, Floats]]()
+    for start in starts / _SCALE:
+        end, trace = minimize.least_squares(
+            start, residual, bounds, eps=DIFFERENCE, xtol=END, max_iter=STEPS, x_scale="jac", verbose=0
+        )
+        ends.append((float(trace[-1].objective), end[:, None]))
+        if ends[-1][0] < 0.5 * NOISE**2 * len(measured):
+            break
+    best = min(ends, key=lambda each: each[0])[1]
+    error = residual(best)
+    slopes, _ = minimize.jacobian_fd(
+        residual, best, error, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
+    )
+    deviation = _deviation(slopes, error[:, 0])
+    found = best[:, 0] * _SCALE
+    angles = np.stack([angle, *chain.simulate(np.stack([chain.nominal, found]))[0]])
+    before, after = np.sqrt(((angles[1:] - angle) ** 2).mean(axis=1)).tolist()
+    return FittedJoint(joint, found, deviation * _SCALE, before, after, sweep.time, angles)
+
+
+def _deviation(slopes: Floats, error: Floats) -> Floats:
+    """Standard deviations (6,) by errors (R,) and their ``slopes`` (R, 6), as if BLOCK rows in a row had one error."""
+    size = np.linalg.norm(slopes, axis=0)
+    slopes = slopes / size
+    variance = BLOCK * float(error @ error) / (len(error) - len(size))
+    return np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes))) / size
+
+
+def _starts(nominal: Floats) -> Floats:
+    """Random starts (TRIES, 6); the scene's armature times a factor."""
+    low, high = np.array([each.start for each in PARAMETERS]).T
+    share = np.random.default_rng(0).random((TRIES, len(PARAMETERS)))
+    starts = low + share * (high - low)
+    starts[:, ARMATURE] *= nominal[ARMATURE]
+    return starts
+
+
+# ---- what is written
+
+
+def table(fit: Fit) -> str:
+    """A line per joint: each number with its standard deviation, and the angle's error before and after."""
+    names = [fit.contract.joints[each.joint] for each in fit.joints]
+    width = max(map(len, names))
+    heads = [f"{each.name} [{each.unit}]" for each in PARAMETERS]
+    lines = ["".join([f"{'joint':<{width}}", *(f"{head:>20}" for head in heads), f"{'error [mrad]':>18}"])]
+    for name, each in zip(names, fit.joints, strict=True):
+        cells = [
+            f"{value:.{p.digits}f} ± {deviation:.{p.digits}f}"
+            for p, value, deviation in zip(PARAMETERS, each.values, each.deviation, strict=True)
+        ]
+        errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f}"
+        lines.append("".join([f"{name:<{width}}", *(f"{cell:>20}" for cell in cells), f"{errors:>18}"]))
+    said = fit.recording.header
+    return "\n".join([*lines, f"{said['task']}, {said['robot']}, {said['began']}; fitted in {fit.seconds:.0f} s"])
+
+
+def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
+    """Fields of the task's config: the numbers of each kind of joint, and ranges that hold each joint's own.
+
+    A range is two standard deviations wider on each side.
+    """
+    values, deviation = fit.values, fit.deviation
+    kinds = _kinds([fit.contract.joints[each.joint] for each in fit.joints])
+    tables, ranges = dict[str, dict[str, float]](), dict[str, list[float]]()
+    for field, column in (("armature", ARMATURE), ("frictionloss", FRICTION)):
+        found, off = values[:, column], deviation[:, column]
+        tables[field] = {kind: _short(found[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
+        mean = np.maximum([tables[field][kind] for kind in kinds], 1e-6)
+        ranges[field] = _range(found / mean, off / mean, 1e-3)
+    ranges["stiffness"] = _range(values[:, GAIN], deviation[:, GAIN], 1e-3)
+    own = fit.contract.damping[[each.joint for each in fit.joints]]
+    if own.all():
+        damping = values[:, GAIN] + values[:, DAMPING] / own
+        ranges["damping"] = _range(damping, deviation[:, GAIN] + deviation[:, DAMPING] / own, 1e-3)
+    ranges["encoder_offset"] = _range(values[:, OFFSET], deviation[:, OFFSET], -1.0)
+    ranges["delay_ms"] = _range(values[:, DELAY], deviation[:, DELAY], 0.0)
+    return {"asset": tables, "domain_rand": {"enable": True, **ranges}}
+
+
+def _kinds(joints: Sequence[str]) -> list[str]:
+    """The part of each name that a joint shares with those of other sides: hip_joint of FL_hip_joint."""
+    rests = [name.partition("_")[2] for name in joints]
+    return [rest if rest and rests.count(rest) > 1 else name for name, rest in zip(joints, rests, strict=True)]
+
+
+def _range(values: Floats, deviation: Floats, least: float) -> list[float]:
+    low, high = float((values - 2.0 * deviation).min()), float((values + 2.0 * deviation).max())
+    return [_short(max(least, low)), _short(high)]
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+LINES = {"measured": ("0.75", 3.0), "by the scene's numbers": ("C1", 0.9), "fitted": ("C0", 0.9)}  # colour, width
+
+
+def draw(fit: Fit, path: Path) -> None:
+    """Write the picture: each joint as measured, with the scene's numbers and with the fitted ones."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserError("drawing a fit needs matplotlib: pip install matplotlib") from None
+    columns = 3
+    count = -(-len(fit.joints) // columns)
+    figure = Figure((15, 2.4 * count + 0.5), layout="constrained")
+    for i, each in enumerate(fit.joints):
+        axes = figure.add_subplot(count, columns, i + 1)
+        for angles, (label, (colour, width)) in zip(each.angles, LINES.items(), strict=True):
+            axes.plot(each.time, angles, color=colour, label=label, linewidth=width)
+        errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f} mrad"
+        axes.set_title(f"{fit.contract.joints[each.joint]}: {errors}", fontsize=8)
+        axes.tick_params(labelsize=6)
+    figure.axes[0].legend(fontsize=6)
+    figure.supxlabel("[s]", fontsize=8)
+    figure.supylabel("[rad]", fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def parse() -> argparse.Namespace:
+    parser = Parser(prog="legged-mw fit", description=__doc__, allow_abbrev=False)
+    parser.add_argument("log", metavar="LOG", help="of legged-mw deploy EXPORT --chirp ...")
+    out = "joints with this in their names are not fitted; again for more"
+    parser.add_argument("--leave_out", action="append", default=[], metavar="NAME", help=out)
+    return parser.parse_args()
+
+
+def main() -> None:
+    args = parse()
+    path = typed(args.log)
+    fit = fit_log(path, leave_out=args.leave_out)
+    picture, fields = path.with_suffix(".png"), path.with_suffix(".yaml")
+    print(table(fit))
+    try:
+        draw(fit, picture)
+        save_yaml(fields, overrides(fit))
+    except OSError as error:
+        raise UserError(f"cannot write beside {shown(path)}: {error.strerror}; move the log") from None
+    print(f"written to {shown(picture)} and {shown(fields)}; train with what was fitted:")
+    print(f"legged-mw train --task {fit.contract.task} --override {shown(fields)}")

@@ -1,0 +1,173 @@
+"""The fit: what it finds of a simulated robot whose numbers were changed, what it writes, and the logs that it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drivers import Script
+
+from benchmarks.fit import Change, ChangedUnitree
+from legged_mw.deploy import chirp, fit
+from legged_mw.deploy.chirp import Chirp, at_rate
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.controller import Controller
+from legged_mw.deploy.joint_check import LIFT, Moves
+from legged_mw.deploy.log import DriveLog, Log, LogError, read_log
+from legged_mw.deploy.robot import Floats, Measurement, RobotError
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.simulated import MujocoRobot, read_scene
+from legged_mw.deploy.states import CHIRP
+from legged_mw.unitree.client import STEP, UnitreeRobot
+from legged_mw.unitree.link import Received
+from legged_mw.utils.task import load_task
+from tests.wires import POLICIES
+
+GO2 = POLICIES / "go2_flat"
+CONTRACT = read_contract(GO2)
+CALF = "FL_calf_joint"
+JOINT = CONTRACT.joints.index(CALF)
+SWEEP = 3.0  # [s]
+EVEN = np.ones(12)
+CHANGE = Change(0.006 * EVEN, 0.052 * EVEN, 0.6 * EVEN, 0.35 * EVEN, 0.9 * EVEN, 0.01 * EVEN)
+
+
+class Lockstep:
+    """Both ends of a wire in memory: each command lets the robot make one step."""
+
+    def __init__(self) -> None:
+        self.state, self.command = b"", b""
+        self.sim: ChangedUnitree = ChangedUnitree(GO2, CONTRACT, self._end(), CHANGE, hoist=True, lift=LIFT)
+        self.sim.step()
+
+    def _end(self) -> Any:
+        owner = self
+
+        class End:
+            def send(self, body: bytes) -> None:
+                owner.state = bytes(body)
+
+            def receive(self) -> bytes | None:
+                return owner.command or None
+
+            def answer(self) -> None: ...
+
+        return End()
+
+    def receive(self) -> Received:
+        return Received(self.state, self.sim.time)
+
+    def arm(self, damping: bytes) -> None: ...
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        self.command = bytes(body)
+        self.sim.step()
+
+    def close(self, last: bytes) -> str:
+        return ""
+
+
+class OneSweep(Chirp):
+    """The sweep of one joint, at once."""
+
+    def _check(self, measured: Measurement) -> Moves:
+        self.state = CHIRP
+        for _ in range(100):
+            yield self._held(self._pose)
+        yield from self._sweep(JOINT)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The log of a sweep of SWEEP s; a sweep has that length in all tests here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (chirp, fit):
+            patch.setattr(module, "SECONDS", len(CONTRACT.joints) * (SWEEP + 2 * chirp.REST))
+        wire = Lockstep()
+        robot = UnitreeRobot(CONTRACT, wire, wire.receive(), simulated=True, clock=lambda: wire.sim.time)
+        contract, limits = at_rate(CONTRACT, Limits.of(GO2, CONTRACT, robot.limits), robot)
+        controller, path = Controller(GO2, contract), tmp_path_factory.mktemp("fit") / "one.lmwlog"
+        states = OneSweep(controller, [Script({1: "start"})], lambda _: None, robot, limits)
+        safety, written = Safety(contract, limits), Log(path, contract, GO2, "simulated")
+        done = run(robot, controller, lambda _: np.zeros(0), 9.0, live=False, safety=safety, states=states, log=written)
+        assert not done.trips and states.over
+        yield path
+
+
+def test_the_numbers_of_a_changed_robot_are_found(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Armature, friction, damping and gain within 10 %, the delay within 2 ms of its 6 and the wire's 2."""
+    monkeypatch.setattr(fit, "TRIES", 32)
+    found = fit.fit_log(log, [CALF])
+    (calf,) = found.joints
+    true = CHANGE.table()[JOINT]
+    assert calf.joint == JOINT and calf.after < 0.0015 < 0.02 < calf.before
+    assert np.abs(calf.values / true - 1.0)[fit.ARMATURE : fit.OFFSET].max() < 0.1
+    assert abs(calf.values[fit.DELAY] - 8.0) < 2.0
+    assert (calf.deviation < 0.1 * np.maximum(true, 0.1)).all()
+    assert CALF in fit.table(found)
+    fields, task = fit.overrides(found), load_task("go2_flat")
+    task.update(fields, where="the fit")
+    assert task.cfg.asset.armature[CALF] == pytest.approx(0.052, rel=0.1)
+    assert task.cfg.domain_rand.stiffness[0] < 0.92 and task.cfg.domain_rand.delay_ms[0] > 5.0
+    fit.draw(found, log.with_suffix(".png"))
+    assert log.with_suffix(".png").stat().st_size > 10_000
+
+
+def changed(column: str, change: Callable[[Floats], Floats]) -> Callable[[DriveLog], DriveLog]:
+    return lambda log: replace(log, rows={**log.rows, column: change(log.rows[column].copy())})
+
+
+def own(values: Floats, new: Floats) -> Floats:
+    values[:, JOINT] = new
+    return values
+
+
+def kept(rows: Callable[[int], slice]) -> Callable[[DriveLog], DriveLog]:
+    return lambda log: replace(log, rows={name: each[rows(len(each))] for name, each in log.rows.items()})
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (changed("joint_pos", lambda q: own(q, q[0, JOINT])), "its encoder is dead"),
+        (changed("joint_pos", lambda q: own(q, q[:, JOINT] + 0.3 * (np.arange(len(q)) > 900))), "encoder jumps by 0.3"),
+        (changed("joint_pos", lambda q: own(q, -1.5 + 0.05 * (q[:, JOINT] + 1.5))), "its motor is loose"),
+        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint does, joint 3 of 12"),
+        (kept(lambda count: slice(0, count, 10)), "has a measurement each 20 ms"),
+        (changed("state", lambda state: 0.0 * state), "holds no chirp"),
+        (changed("joint_pos", lambda q: q[:, :10]), "is of a robot with 10 joints"),
+    ],
+)
+def test_a_log_that_cannot_be_fitted_is_refused(log: Path, change: Callable[[DriveLog], DriveLog], why: str) -> None:
+    recording, model = read_log(log), read_scene(GO2, CONTRACT).model
+    assert [sweep.joint for sweep in fit.read_sweeps(log, recording, CONTRACT, model, [CALF])] == [JOINT]
+    with pytest.raises(LogError, match=why):
+        fit.read_sweeps(log, change(recording), CONTRACT, model, [CALF])
+
+
+def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
+    swing = np.sin(np.arange(1000.0))
+    joint = fit.FittedJoint(JOINT, np.zeros(6), np.zeros(6), 0.5, 0.36, np.arange(1000.0), np.stack([swing] * 3))
+    with pytest.raises(LogError, match=r"FL_calf_joint cannot be fitted: the best numbers explain 74.1%"):
+        fit._check_explained(Path("log"), CALF, joint)
+    fit._check_explained(Path("log"), CALF, joint._replace(after=0.05))
+
+
+def test_sweeps_keep_the_contracts_limits() -> None:
+    """Within ranges and torques of all joints, also where the contract has no ratings."""
+    limits, robot = Limits.of(GO2, CONTRACT), MujocoRobot(GO2, CONTRACT, hoisted=True)
+    for contract in (CONTRACT, replace(CONTRACT, ratings=None)):
+        fast = replace(contract, period=STEP, decimation=1)
+        sweeps = Chirp(Controller(GO2, fast), [], lambda _: None, robot, limits)
+        for joint in range(12):
+            targets = CONTRACT.default_pose[joint] + sweeps.targets(joint)
+            assert limits.lowest[joint] < targets.min() < targets.max() < limits.highest[joint]
+            assert CONTRACT.stiffness[joint] * np.abs(sweeps.targets(joint)).max() < 0.5 * limits.motor[joint]
+            assert np.abs(np.diff(targets)).max() < STEP * chirp.FASTEST * 1.5
+    with pytest.raises(RobotError, match="measurements each few ms"):
+        at_rate(CONTRACT, limits, robot)
