@@ -432,6 +432,11 @@ def test_a_log_says_where_a_training_writes_and_how_it_ended(tmp_path: Path) -> 
     assert sweep.read_log(file)[:3] == ("", "failed: code 2", False) and sweep.read_log(file).failed
 
 
+def test_trainings_at_a_time_share_the_cores() -> None:
+    assert sweep.shares_of([0, 1, 4, 5, 6], 2) == [[0, 1], [4, 5]] and sweep.shares_of([2, 3], 1) == [[2, 3]]
+    assert sweep.shares_of([2, 3], 3) == [[2], [3], [2]]
+
+
 def test_settings_are_ranked_by_their_places_in_each_figure() -> None:
     """Not by the figures themselves, whose units differ; and those that lack an exam come after all that do not."""
     better = {"error": False, "pushes": True}

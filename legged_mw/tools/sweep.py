@@ -225,14 +225,17 @@ def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tup
     """Run ``at_once`` trainings at a time; yields number and exit code of each that ends. A terminal shows a last line.
 
     After a signal no other begins, and each that runs gets one SIGTERM, so that it saves: a second would end it at once.
-    They are in process groups of their own, since a terminal, or ``timeout``, sends its signal to a whole group.
+    They are in process groups of their own, since a terminal, or ``timeout``, sends its signal to a whole group. Each has
+    its share of the cores: two that share them slow each other down many times (rl/runner.py, UpdateThreads).
     """
     waiting, running, told = list(enumerate(trainings)), dict[int, subprocess.Popen[bytes]](), False
+    shares, uses = shares_of(cores(), at_once), dict[int, int]()
     try:
         while running or (waiting and not stop.asked):
             while waiting and len(running) < at_once and not stop.asked:
                 i, training = waiting.pop(0)
-                running[i] = _start(training)
+                uses[i] = min({*range(at_once)} - {uses[other] for other in running})
+                running[i] = _start(training, shares[uses[i]])
             if stop.asked and not told:
                 told = True
                 for process in running.values():
@@ -249,7 +252,19 @@ def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tup
             process.terminate()
 
 
-def _start(training: Training) -> subprocess.Popen[bytes]:
+def cores() -> list[int]:
+    """The cores that this process may use; empty where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def shares_of(cores: Sequence[int], count: int) -> list[Sequence[int]]:
+    """``count`` equal shares, of at least one core if there is any."""
+    size = max(1, len(cores) // count)
+    whole = max(1, len(cores) // size)
+    return [cores[i % whole * size :][:size] for i in range(count)]
+
+
+def _start(training: Training, share: Sequence[int]) -> subprocess.Popen[bytes]:
     """A child process that ends with this one. Called from the main thread, for ``preexec_fn``."""
     with open(training.log, "wb") as log:
         return subprocess.Popen(
@@ -258,18 +273,19 @@ def _start(training: Training) -> subprocess.Popen[bytes]:
             stdout=log,
             stderr=subprocess.STDOUT,
             process_group=0,
-            preexec_fn=_end_with(os.getpid()),
+            preexec_fn=_first(os.getpid(), share),
         )
 
 
-def _end_with(parent: int) -> Callable[[], object] | None:
-    """The first function of a child, so that it gets SIGTERM at any end of ``parent``. None if not on Linux."""
+def _first(parent: int, share: Sequence[int]) -> Callable[[], object] | None:
+    """The first function of a child: it takes its cores, and gets SIGTERM at any end of ``parent``. None if not on Linux."""
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
 
     def first() -> None:
         prctl(_PDEATHSIG, int(signal.SIGTERM))
+        os.sched_setaffinity(0, share)
         if os.getppid() != parent:  # the parent has already ended
             os._exit(1)
 
