@@ -428,6 +428,8 @@ def test_a_log_says_where_a_training_writes_and_how_it_ended(tmp_path: Path) -> 
     assert log.folder == str(tmp_path) and log.done and log.exam == {"falls": 3.0, "error_vx": 0.125}
     file.write_text(said(tmp_path, "falls 3.000", "stopped: SIGTERM; go on with\n  train --resume --max_time 37s\n"))
     assert sweep.read_log(file) == sweep.Log(str(tmp_path), "stopped: SIGTERM; go on with", False, "37s", {}, False)
+    file.write_text(file.read_text() + "killed as it began again\n")
+    assert sweep.read_log(file)[1:4] == ("killed as it began again", False, "37s")
     file.write_text("bad\nlast\nfailed: code 2\n")
     assert sweep.read_log(file)[:3] == ("", "failed: code 2", False) and sweep.read_log(file).failed
 
@@ -554,9 +556,9 @@ def test_a_cluster_gets_the_lines_of_a_round(
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 8 and not cluster.asked
     for line in lines:
-        flags = shlex.split(line.partition(" > ")[0])[2:]
+        flags = shlex.split(line.partition(" >> ")[0])[2:]
         log = cluster.folder / shlex.split(line)[-1]
-        [*cluster.run([sweep.Training("", flags, log)], 1, sweep.Stop())]
+        next(cluster.run([sweep.Training("", flags, log)], 1, sweep.Stop()))
     log.write_text("killed\nfailed: code 137\n")  # 0.8, seed 2
     halve(monkeypatch, "--print")
     second = capsys.readouterr().out.splitlines()

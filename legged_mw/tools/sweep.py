@@ -266,7 +266,7 @@ def shares_of(cores: Sequence[int], count: int) -> list[Sequence[int]]:
 
 def _start(training: Training, share: Sequence[int]) -> subprocess.Popen[bytes]:
     """A child process that ends with this one. Called from the main thread, for ``preexec_fn``."""
-    with open(training.log, "wb") as log:
+    with open(training.log, "ab") as log:  # one that is killed at once keeps what was there
         return subprocess.Popen(
             [*TRAIN, *training.flags],
             stdin=subprocess.DEVNULL,
@@ -306,7 +306,7 @@ def _last_iteration(log: Path) -> str:
 
 
 def read_log(file: Path) -> Log:
-    """What is known of a training from what it printed; all empty without the file."""
+    """What is known of a training from what it printed, at one start after the other; all empty without the file."""
     text = file.read_text(errors="replace").strip() if file.is_file() else ""
 
     def last(pattern: str) -> str:
@@ -317,7 +317,7 @@ def read_log(file: Path) -> Log:
     exam = re.findall(r"(\w+) (-?\d+\.\d+)", last(r"^exam after \d+ iterations: (.*)$"))
     return Log(
         folder=last(r"^writing to (.*)$"),
-        last=last(r"^stopped: .*$") or text.rpartition("\n")[2],
+        last=last(r"^(stopped: .*)\n.*\Z") or text.rpartition("\n")[2],
         done=done,
         left=last(r"^stopped: .*\n.* --max_time (\S+)$"),
         exam={name: float(value) for name, value in exam if done},
@@ -376,7 +376,7 @@ class Halving:
         """``training`` for a shell, which notes a failure in the file: the line is not printed again."""
         training = self.training(cell, number)
         file = shlex.quote(shown(training.log))
-        return f"{command('train')} {shlex.join(training.flags)} > {file} 2>&1 || echo failed: code $? >> {file}"
+        return f"{command('train')} {shlex.join(training.flags)} >> {file} 2>&1 || echo failed: code $? >> {file}"
 
     def rounds(self, cell: Cell) -> int:
         """How many rounds its training has done."""
