@@ -424,14 +424,16 @@ def test_values_stand_apart_by_commas() -> None:
 
 def test_a_log_says_where_a_training_writes_and_how_it_ended(tmp_path: Path) -> None:
     (file := tmp_path / "log").write_text(said(tmp_path, "falls 3.000, error_vx 0.125"))
-    log = sweep.read_log(file)
+    log = sweep.read_printed(file)
     assert log.folder == str(tmp_path) and log.done and log.exam == {"falls": 3.0, "error_vx": 0.125}
     file.write_text(said(tmp_path, "falls 3.000", "stopped: SIGTERM; go on with\n  train --resume --max_time 37s\n"))
-    assert sweep.read_log(file) == sweep.Log(str(tmp_path), "stopped: SIGTERM; go on with", False, "37s", {}, False)
+    assert sweep.read_printed(file) == sweep.Printed(
+        str(tmp_path), "stopped: SIGTERM; go on with", False, "37s", {}, False
+    )
     file.write_text(file.read_text() + "killed as it began again\n")
-    assert sweep.read_log(file)[1:4] == ("killed as it began again", False, "37s")
+    assert sweep.read_printed(file)[1:4] == ("killed as it began again", False, "37s")
     file.write_text("bad\nlast\nfailed: code 2\n")
-    assert sweep.read_log(file)[:3] == ("", "failed: code 2", False) and sweep.read_log(file).failed
+    assert sweep.read_printed(file)[:3] == ("", "failed: code 2", False) and sweep.read_printed(file).failed
 
 
 def test_trainings_at_a_time_share_the_cores() -> None:
@@ -563,6 +565,9 @@ def test_a_cluster_gets_the_lines_of_a_round(
     halve(monkeypatch, "--print")
     second = capsys.readouterr().out.splitlines()
     assert len(second) == 4 and all("--max_time 180s --resume --load_run" in line for line in second)
+    halve(monkeypatch, "--print", "--rounds", "1", code=1)
+    out, err = capsys.readouterr()
+    assert out == "" and "best: gamma=0.97; " in err and "some failed: " in err
 
 
 # ---- completion

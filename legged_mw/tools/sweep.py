@@ -76,7 +76,7 @@ class Training(NamedTuple):
     log: Path
 
 
-class Log(NamedTuple):
+class Printed(NamedTuple):
     """What a training has printed."""
 
     folder: str  # of its run, or ""
@@ -205,14 +205,14 @@ def check(cells: Sequence[Cell], common: list[str]) -> tuple[argparse.Namespace,
 # ---- trainings in child processes
 
 
-def train_all(trainings: Sequence[Training], at_once: int, stop: Stop) -> dict[int, Log]:
+def train_all(trainings: Sequence[Training], at_once: int, stop: Stop) -> dict[int, Printed]:
     """Train, and report each as it ends. Returns the logs of those that saved, by number.
 
     If somebody else stops a training, it stops the sweep too.
     """
-    ended: dict[int, Log] = {}
+    ended: dict[int, Printed] = {}
     for done, (i, code) in enumerate(run(trainings, at_once, stop), 1):
-        log = read_log(trainings[i].log)
+        log = read_printed(trainings[i].log)
         saved = bool(log.folder) and code in (0, STOPPED)
         print(f"{done}/{len(trainings)} {trainings[i].name}: {log.folder if saved else log.last}", flush=True)
         if saved:
@@ -305,7 +305,7 @@ def _last_iteration(log: Path) -> str:
     return lines[-1] if lines else ""
 
 
-def read_log(file: Path) -> Log:
+def read_printed(file: Path) -> Printed:
     """What is known of a training from what it printed, at one start after the other; all empty without the file."""
     text = file.read_text(errors="replace").strip() if file.is_file() else ""
 
@@ -315,7 +315,7 @@ def read_log(file: Path) -> Log:
 
     done = bool(last(r"^done: "))
     exam = re.findall(r"(\w+) (-?\d+\.\d+)", last(r"^exam after \d+ iterations: (.*)$"))
-    return Log(
+    return Printed(
         folder=last(r"^writing to (.*)$"),
         last=last(r"^(stopped: .*)\n.*\Z") or text.rpartition("\n")[2],
         done=done,
@@ -361,8 +361,8 @@ class Halving:
     def file(self, cell: Cell, number: int) -> Path:
         return self.folder / f"round_{number}_{cell.label}.txt"
 
-    def log(self, cell: Cell, number: int) -> Log:
-        return read_log(self.file(cell, number))
+    def log(self, cell: Cell, number: int) -> Printed:
+        return read_printed(self.file(cell, number))
 
     def training(self, cell: Cell, number: int) -> Training:
         """The training of round ``number``: a new run in the first one; a run that a signal stopped gets the time left."""
@@ -382,7 +382,7 @@ class Halving:
         """How many rounds its training has done."""
         return next(number for number in count() if not self.log(cell, number + 1).done)
 
-    def last(self, cell: Cell) -> Log:
+    def last(self, cell: Cell) -> Printed:
         """The log of the last round that is done."""
         return self.log(cell, self.rounds(cell))
 
@@ -400,6 +400,7 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
     """Train round after round. Rounds that are done, of an earlier call or by a cluster, are not trained again."""
     places, failed = list(dict.fromkeys(cell.setting for cell in halving.cells)), False
     left, better = places, ranked_figures(halving.task.exam)
+    out = sys.stderr if args.print else sys.stdout  # a shell runs what --print prints
     stop.listen()
     for number in count(1):
         able = [cell for cell in halving.cells if cell.setting in left and halving.rounds(cell) >= number - 1]
@@ -408,10 +409,10 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
             lines := [halving.line(cell, number) for cell in todo if not halving.log(cell, number).failed]
         ):
             print("\n".join(lines))
-            print(f"round {number}; when these have ended, the same command prints the next", file=sys.stderr)
+            print(f"round {number}; when these have ended, the same command prints the next", file=out)
             return
         if todo and not args.print:
-            print(f"round {number}: {len(todo)} trainings, {len(left)} settings", flush=True)
+            print(f"round {number}: {', '.join(left)}; to train: {len(todo)}", flush=True)
             train_all([halving.training(cell, number) for cell in todo], args.jobs, stop)
         if stop.asked:
             break
@@ -425,7 +426,7 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
             break
         left = ranked[: math.ceil(len(ranked) / THIRD)]
     if found := halving.found(places):
-        print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}")
+        print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}", file=out)
     if stop.asked:
         print(f"stopped in round {number}; go on with\n  {command('sweep')} {shlex.join(sys.argv[1:])}")
         raise SystemExit(STOPPED)
@@ -435,9 +436,9 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
         if cell.setting == places[0] and (log := halving.last(cell)).done
     }
     watch = shlex.join(["--task", args.task, "--load_run", rank(runs, better)[0]])
-    print(f"best: {places[0]}; watch it with\n  {command('play')} {watch}")
+    print(f"best: {places[0]}; watch it with\n  {command('play')} {watch}", file=out)
     if failed:
-        print(f"some failed: what they said is in {shown(halving.folder)}; the same command trains them again")
+        print(f"some failed: what they said is in {shown(halving.folder)}; without --print they train again", file=out)
         raise SystemExit(1)
 
 
