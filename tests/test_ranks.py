@@ -16,6 +16,7 @@ from learner import difference
 from legged_mw import ROOT
 from legged_mw.rl.ranks import Rank, rank_device, this_rank
 from legged_mw.rl.run_folder import checkpoints
+from legged_mw.utils.cli import command
 from legged_mw.utils.config import load_yaml
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
@@ -166,6 +167,15 @@ def test_rank_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> N
     assert this_rank() == Rank(9, 1, 16) and not this_rank().leads
     monkeypatch.delenv("WORLD_SIZE")
     assert this_rank() == Rank(0, 0, 1)  # a RANK left over from elsewhere is no run of several
+
+
+def test_the_line_that_resumes_starts_as_many_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    assert command("train") == "python train.py" and command("train", 2) == "torchrun --nproc_per_node=2 train.py"
+    for name, value in (("GROUP_WORLD_SIZE", "2"), ("MASTER_ADDR", "10.0.0.1")):
+        monkeypatch.setenv(name, value)
+    nodes = "--nnodes=2 --node_rank=N --master_addr=10.0.0.1 --nproc_per_node=8"
+    assert command("train", 16) == f"torchrun {nodes} train.py"
 
 
 def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
