@@ -434,6 +434,8 @@ def test_a_log_says_where_a_training_writes_and_how_it_ended(tmp_path: Path) -> 
     assert sweep.read_printed(file)[1:4] == ("killed as it began again", False, "37s")
     file.write_text("bad\nlast\nfailed: code 2\n")
     assert sweep.read_printed(file)[:3] == ("", "failed: code 2", False) and sweep.read_printed(file).failed
+    file.write_text("failed: code 3\n")
+    assert not sweep.read_printed(file).failed  # a signal
 
 
 def test_trainings_at_a_time_share_the_cores() -> None:
