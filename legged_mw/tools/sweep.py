@@ -321,7 +321,7 @@ def read_printed(file: Path) -> Printed:
         done=done,
         left=last(r"^stopped: .*\n.* --max_time (\S+)$"),
         exam={name: float(value) for name, value in exam if done},
-        failed=bool(last(r"^failed: code (?!3$)")) or bool(last(r"^failed: code (?!3$)\d+")),
+        failed=bool(last(r"^failed: code (?!3$)")),
     )
 
 
