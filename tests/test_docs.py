@@ -37,6 +37,7 @@ ELSEWHERE = {
 # pattern of a command -> why no test runs it as it stands; those of our programs have their flags read all the same
 WHY_NOT = {
     r"^(pip|pipx|uvx|docker|eval|apt|source|make|tensorboard|git|sudo)\b": "sets up a machine; CI itself is make lint and make test",
+    r"^sbatch |nvidia-cuda-mps-control": "another program's: of a cluster, of a GPU",
     r"^legged-mw ": "test_tools.py and test_wheel.py start the programs",
     r"^torchrun ": "several GPUs: test_ranks.py on a CPU, test_gpu.py",
     r"examples/cpp": "test_cpp_example.py compiles and runs it",

@@ -16,6 +16,7 @@ from learner import difference
 from legged_mw import ROOT
 from legged_mw.rl.ranks import Rank, rank_device, this_rank
 from legged_mw.rl.run_folder import checkpoints
+from legged_mw.utils.cli import command
 from legged_mw.utils.config import load_yaml
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
@@ -27,9 +28,11 @@ def launch(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*LAUNCH, *words], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=1200)
 
 
-def learn(folder: Path, dies_in: int = 0, *more: str) -> subprocess.CompletedProcess[str]:
-    folder.mkdir()
-    return launch(str(ROOT / "tests/ranks_program.py"), str(folder), str(dies_in), *more)
+def learn(place: Path, *parts: str, on: str = "cpu") -> subprocess.CompletedProcess[str]:
+    """Do parts of ranks_program.py, one after the other; each writes into a folder of its name in ``place``."""
+    for part in parts:
+        (place / part).mkdir()
+    return launch(str(ROOT / "tests/ranks_program.py"), str(place), on, *parts)
 
 
 def ends(folder: Path) -> list[dict[str, Any]]:
@@ -37,14 +40,20 @@ def ends(folder: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("ranks") / "ours"
-    result = learn(folder)
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of parts that all ranks survive: two processes do them all, since a start costs more than they do."""
+    folder = tmp_path_factory.mktemp("ranks")
+    result = learn(folder, "learns", "asked", "updates")
     assert result.returncode == 0, result.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ours(parts: Path) -> Path:
     # the other rank has no folder here
     written = ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt", "worlds_3_0of2.pt"]
-    assert sorted(path.name for path in folder.glob("*.pt")) == written
-    return folder
+    assert sorted(path.name for path in (parts / "learns").glob("*.pt")) == written
+    return parts / "learns"
 
 
 def test_ranks_learn_one_policy_from_worlds_of_their_own(ours: Path) -> None:
@@ -64,10 +73,8 @@ def test_statistics_are_of_all_ranks(ours: Path) -> None:
     assert one["means"] == other["means"] and one["means"]["episodes"] > 0
 
 
-def check_updates(folder: Path, *more: str) -> None:
+def check_updates(folder: Path) -> None:
     """On each of two ranks, from equal states and experience of its own: averaged gradients, KL divergence, rate and normalisers."""
-    result = launch(str(ROOT / "tests/ranks_update.py"), str(folder), *more)
-    assert result.returncode == 0, result.stderr
     one, other = ends(folder)
     assert difference(one["parameters"], other["parameters"]) == 0.0 and not torch.equal(one["obs"], other["obs"])
     for end in (one, other):
@@ -76,15 +83,13 @@ def check_updates(folder: Path, *more: str) -> None:
             assert update["rates"][0] == pytest.approx(update["rates"][1], rel=1e-6)
 
 
-def test_same_update_as_rsl_rls_own_on_two_ranks(tmp_path: Path) -> None:
-    check_updates(tmp_path)
+def test_same_update_as_rsl_rls_own_on_two_ranks(parts: Path) -> None:
+    check_updates(parts / "updates")
 
 
-def test_one_asked_to_stop_stops_all(tmp_path: Path) -> None:
+def test_one_asked_to_stop_stops_all(parts: Path) -> None:
     """Until then they learned one policy, with the estimator that these have."""
-    result = learn(tmp_path / "asked", -1)
-    assert result.returncode == 0, result.stderr
-    one, other = ends(tmp_path / "asked")
+    one, other = ends(parts / "asked")
     assert (one["stop"], other["stop"]) == ("another rank was asked to", "asked")
     assert one["iteration"] == other["iteration"] == 1
     assert difference(one["parameters"], other["parameters"]) == 0.0
@@ -119,8 +124,8 @@ def test_train_writes_one_run_folder(tmp_path: Path) -> None:
 
 def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     """The other does not wait for ever, and what was saved can be loaded."""
-    folder = tmp_path / "dies"
-    result = learn(folder, 2)
+    folder = tmp_path / "dies-2"
+    result = learn(tmp_path, "dies-2")
     assert result.returncode != 0
     newest = max(checkpoints(folder))
     assert newest in (1, 2)  # the second is on its way to the disk while the other rank dies
@@ -164,6 +169,15 @@ def test_rank_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> N
     assert this_rank() == Rank(0, 0, 1)  # a RANK left over from elsewhere is no run of several
 
 
+def test_the_line_that_resumes_starts_as_many_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    assert command("train") == "python train.py" and command("train", 2) == "torchrun --nproc_per_node=2 train.py"
+    for name, value in (("GROUP_WORLD_SIZE", "2"), ("MASTER_ADDR", "10.0.0.1")):
+        monkeypatch.setenv(name, value)
+    nodes = "--nnodes=2 --node_rank=N --master_addr=10.0.0.1 --nproc_per_node=8"
+    assert command("train", 16) == f"torchrun {nodes} train.py"
+
+
 def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert rank_device(Rank(0, 0, 1), None) is None and rank_device(Rank(0, 0, 1), "cuda:1") == "cuda:1"
@@ -173,23 +187,25 @@ def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.two_gpus
 def test_two_gpus_learn_one_policy(tmp_path: Path) -> None:
     """Through NCCL inside the recorded update: equal on both ranks after eight iterations."""
-    result = learn(tmp_path / "ours", 0, "gpus")
+    result = learn(tmp_path, "learns", on="gpus")
     assert result.returncode == 0, result.stderr
     assert "does not close" not in result.stderr
-    one, other = ends(tmp_path / "ours")
+    one, other = ends(tmp_path / "learns")
     assert difference(one["parameters"], other["parameters"]) == 0.0 and one["rate"] == other["rate"]
     assert not torch.equal(one["obs"], other["obs"]) and one["means"] == other["means"]
 
 
 @pytest.mark.two_gpus
 def test_same_update_as_rsl_rls_own_on_two_gpus(tmp_path: Path) -> None:
-    check_updates(tmp_path, "gpus")
+    result = learn(tmp_path, "updates", on="gpus")
+    assert result.returncode == 0, result.stderr
+    check_updates(tmp_path / "updates")
 
 
 @pytest.mark.two_gpus
 def test_on_two_gpus_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
-    result = learn(tmp_path / "dies", 6, "gpus")
+    result = learn(tmp_path, "dies-6", on="gpus")
     assert result.returncode != 0
-    newest = max(int(file.stem.partition("_")[2]) for file in (tmp_path / "dies").glob("model_*.pt"))
+    newest = max(int(file.stem.partition("_")[2]) for file in (tmp_path / "dies-6").glob("model_*.pt"))
     assert newest >= 5  # of the sixth update, the dying rank's share may still have been on its way
-    assert torch.load(tmp_path / f"dies/model_{newest}.pt", weights_only=True)["iter"] == newest
+    assert torch.load(tmp_path / f"dies-6/model_{newest}.pt", weights_only=True)["iter"] == newest

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -298,43 +300,52 @@ def test_compare_prints_figures_exams_and_settings(
     assert curves == [["curves:", "tensorboard", "--logdir", "logs/go1_flat"]]
 
 
-def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) -> None:
-    cells = sweep.make_cells(["a.b=1,2", "c.d=[3, 4]"], ["1", "2"])
-    assert [cell.name for cell in cells] == ["b=1 seed=1", "b=1 seed=2", "b=2 seed=1", "b=2 seed=2"]
+def said(folder: Path, exam: str = "", end: str = "done: x; watch it with\n") -> str:
+    """What a training prints."""
+    exam = f"exam after 10 iterations: {exam}\n" if exam else ""
+    return f"writing to {folder}\nLearning iteration 1/2: ...\n{exam}{end}"
+
+
+def test_a_sweep_trains_every_combination_and_ends_with_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked: list[list[str]] = []
 
-    def start(flags: list[str]) -> tuple[int, str, str]:
-        asked.append(flags)
-        if len(asked) == 4:
-            return 2, "", "train.py: wrong"
-        return 0, str(write_run(tmp_path / f"{len(asked)}", reward=len(asked))), ""
+    def run(trainings: list[sweep.Training], at_once: int, _: sweep.Stop) -> Iterator[tuple[int, int]]:
+        for i in (1, 0, 3, 2):  # two at a time end in any order
+            asked.append(trainings[i].flags)
+            folder = write_run(tmp_path / f"{i}", reward=i + 1) if i < 3 else ""
+            trainings[i].log.write_text(said(folder) if folder else "train.py: wrong\n")
+            yield i, 0 if folder else 2
 
-    found = sweep.train_all(cells, ["--task", "go1_flat"], start, sweep.Stop())
-    assert asked[0] == [
-        *["--task", "go1_flat", "--set", "a.b=1", "--set"],
-        "c.d=[3, 4]",
-        *["--set", "seed=1", "--run_name", "b=1_seed=1"],
+    monkeypatch.setattr(sweep, "run", run)
+    flags = ["--seeds", "1,2", "--set", "algorithm.gamma=0.9,0.97", "--set", "actor.hidden_dims=[64, 32]"]
+    with pytest.raises(SystemExit, match="1"):
+        program("sweep", "--task", "go1_flat", *flags, monkeypatch=monkeypatch)
+    assert asked[1] == [
+        *["--task", "go1_flat", "--set", "algorithm.gamma=0.9", "--set", "actor.hidden_dims=[64, 32]"],
+        *["--set", "seed=1", "--run_name", "gamma=0.9_seed=1"],
     ]
-    lines = [line.split() for line in sweep.table(found).splitlines()]
-    assert lines[0] == ["b", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
+    out = capsys.readouterr().out
+    assert "3/4 gamma=0.97 seed=2: train.py: wrong\n" in out
+    lines = [line.split() for line in out.split("\n\n")[1].splitlines()]
+    assert lines[0] == ["gamma", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
     assert [(line[0], line[1], line[6]) for line in lines[1:4]] == [
-        ("1", "1", "10.00"),
-        ("1", "2", "20.00"),
-        ("2", "1", "30.00"),
+        ("0.9", "1", "10.00"),
+        ("0.9", "2", "20.00"),
+        ("0.97", "1", "30.00"),
     ]
-    assert lines[4][:4] == ["1", "mean", "of", "2"] and "15.00 ± 7.07" in " ".join(lines[4])
+    assert lines[4][:4] == ["0.9", "mean", "of", "2"] and "15.00 ± 7.07" in " ".join(lines[4])
 
 
-def test_a_sweep_ends_where_a_signal_stops_it(tmp_path: Path) -> None:
+def test_a_sweep_ends_where_a_signal_stops_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert sweep.STOPPED == training.STOPPED
-    cells, flags = sweep.make_cells([], ["1", "2", "3"]), []
-
-    def start(asked: list[str]) -> tuple[int, str, str]:
-        flags.append(asked)
-        code, said = (sweep.STOPPED, "stopped: SIGINT; go on with") if len(flags) == 2 else (0, "")
-        return code, str(write_run(tmp_path / f"{len(flags)}")), said
-
-    assert len(sweep.train_all(cells, [], start, sweep.Stop())) == len(flags) == 2
+    code = "import sys; print('writing to x'); sys.exit(int(sys.argv[1]))"
+    monkeypatch.setattr(sweep, "TRAIN", [sys.executable, "-Sc", code])
+    trainings = [sweep.Training(f"{i}", [f"{end}"], tmp_path / f"{i}") for i, end in enumerate((0, sweep.STOPPED, 0))]
+    stop = sweep.Stop()
+    assert [*sweep.train_all(trainings, 1, stop)] == [0, 1] and stop.asked
+    assert sweep.train_all(trainings, 1, stop) == {}  # a signal before the first
 
 
 FAKE = """
@@ -356,41 +367,25 @@ while True:
 @pytest.mark.parametrize("state", ["starts", "trains"])
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL"])
 def test_no_training_outlives_its_sweep(name: str, state: str, tmp_path: Path) -> None:
-    """And no other begins; one that has not yet begun to train is not there to save."""
+    """And no other begins; one that has not yet begun to train is not there to save.
+
+    The signal goes to the whole group, twice, as from ``timeout`` or a terminal that closes: a training takes a second
+    SIGTERM as: at once, without saving.
+    """
     (tmp_path / "fake.py").write_text(FAKE)
     os.mkfifo(tmp_path / "told")
     fake = [sys.executable, "fake.py", "told", state]
     code = f"from legged_mw.tools import sweep\nsweep.TRAIN, sweep.check = {fake}, lambda *_: None\nsweep.main()\n"
-    command = [sys.executable, "-c", code, "--task", "go1_flat", "--seeds", "1,2"]
-    with subprocess.Popen(
-        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=-1, text=True
-    ) as ours:
+    command = [sys.executable, "-c", code, "--task", "go1_flat", "--seeds", "1,2,3", "--jobs", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=-1, text=True, start_new_session=True) as ours:
         with open(tmp_path / "told") as told:
-            assert told.readline() == "begins\n"
-            ours.send_signal(signal.Signals[name])
-            assert told.read() == ("SIGTERM" if state == "trains" else "")  # to its end, when nobody holds it open
-        assert ours.stdout and "2/2" not in ours.stdout.read()
+            assert told.readline() == told.readline() == "begins\n"
+            for _ in range(2):
+                os.killpg(ours.pid, signal.Signals[name])
+            assert told.read() == ("SIGTERM" * 2 if state == "trains" else "")  # to its end, when nobody holds it open
+        assert ours.stdout and "3/3" not in ours.stdout.read()
     assert ours.returncode == (-signal.SIGKILL if name == "SIGKILL" else 1)
-
-
-def test_a_terminal_that_hangs_up_twice_stops_a_training_once() -> None:
-    """A training takes a second SIGTERM as: at once, without saving."""
-    stop, asked = sweep.Stop(), []
-    stop.training = SimpleNamespace(terminate=lambda: asked.append(1))  # type: ignore[assignment]
-    stop()
-    stop()
-    assert asked == [1]
-
-
-def test_a_signal_between_two_trainings_ends_a_sweep(tmp_path: Path) -> None:
-    stop, started = sweep.Stop(), []
-
-    def start(asked: list[str]) -> tuple[int, str, str]:
-        started.append(asked)
-        stop()
-        return 0, str(write_run(tmp_path / "one")), ""
-
-    assert len(sweep.train_all(sweep.make_cells([], ["1", "2"]), [], start, stop)) == len(started) == 1
 
 
 @pytest.mark.parametrize(
@@ -405,7 +400,7 @@ def test_a_signal_between_two_trainings_ends_a_sweep(tmp_path: Path) -> None:
 def test_a_wrong_value_is_found_before_the_first_training(
     flags: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sweep, "start", lambda *_, **__: pytest.fail("it began"))
+    monkeypatch.setattr(sweep, "run", lambda *_: pytest.fail("it began"))
     with pytest.raises(SystemExit, match="2"):
         program("sweep", "--task", "go1_flat", "--seeds", "1,2", *flags, monkeypatch=monkeypatch)
     err = capsys.readouterr().err
@@ -427,11 +422,154 @@ def test_values_stand_apart_by_commas() -> None:
     assert sweep.values("{a: [1,2]},'x,y'") == ["{a: [1,2]}", "'x,y'"]
 
 
-def test_a_training_of_a_sweep_says_where_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fake = "import sys\nprint('writing to logs/x')\nprint('Learning iteration 1/2: ...')\nprint('stopped: SIGINT; go on with')\n"
-    (tmp_path / "fake").write_text(fake + "print('bad\\nlast', file=sys.stderr)")
-    monkeypatch.setattr(sweep, "TRAIN", [sys.executable, str(tmp_path / "fake")])
-    assert sweep.start([], sweep.Stop()) == (0, "logs/x", "stopped: SIGINT; go on with")
+def test_a_log_says_where_a_training_writes_and_how_it_ended(tmp_path: Path) -> None:
+    (file := tmp_path / "log").write_text(said(tmp_path, "falls 3.000, error_vx 0.125"))
+    log = sweep.read_printed(file)
+    assert log.folder == str(tmp_path) and log.done and log.exam == {"falls": 3.0, "error_vx": 0.125}
+    file.write_text(said(tmp_path, "falls 3.000", "stopped: SIGTERM; go on with\n  train --resume --max_time 37s\n"))
+    assert sweep.read_printed(file) == sweep.Printed(
+        str(tmp_path), "stopped: SIGTERM; go on with", False, "37s", {}, False
+    )
+    file.write_text(file.read_text() + "killed as it began again\n")
+    assert sweep.read_printed(file)[1:4] == ("killed as it began again", False, "37s")
+    file.write_text("bad\nlast\nfailed: code 2\n")
+    assert sweep.read_printed(file)[:3] == ("", "failed: code 2", False) and sweep.read_printed(file).failed
+    file.write_text("failed: code 3\n")
+    assert not sweep.read_printed(file).failed  # a signal
+
+
+def test_trainings_at_a_time_share_the_cores() -> None:
+    assert sweep.shares_of([0, 1, 4, 5, 6], 2) == [[0, 1], [4, 5]] and sweep.shares_of([2, 3], 1) == [[2, 3]]
+    assert sweep.shares_of([2, 3], 3) == [[2], [3], [2]]
+
+
+def test_settings_are_ranked_by_their_places_in_each_figure() -> None:
+    """Not by the figures themselves, whose units differ; and those that lack an exam come after all that do not."""
+    better = {"error": False, "pushes": True}
+    exams = {
+        "a": [{"error": 0.5, "pushes": 0.2}, {"error": 0.1, "pushes": 0.2}],  # means 0.3, 0.2: places 2 and 3
+        "b": [{"error": 0.2, "pushes": 0.9}, {"error": 0.2, "pushes": 0.7}],  # 1 and 1
+        "best, in one of two": [{"error": 0.0, "pushes": 1.0}, {}],
+        "none": [{}, {}],
+        "c": [{"error": 9.0, "pushes": 0.5}, {"error": 9.0, "pushes": 0.5}],  # 3 and 2, before a only by "error"
+    }
+    assert sweep.rank(exams, better) == ["b", "a", "c", "best, in one of two", "none"]
+    assert sweep.rank(exams, {"pushes": True})[:3] == ["b", "c", "a"]
+    assert sweep.rank(exams, {"pushes": True, "unknown": False})[:3] == ["b", "c", "a"]
+    assert sweep.ranked_figures("getup") == {"stands": True, "stays": True}
+
+
+class Cluster:
+    """Trains nothing: the exam is the worse the farther gamma is from 0.97, and seed 2 falls once more."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.asked, self.breaks, self.stops = folder, list[str](), "", ""
+
+    def run(self, trainings: list[sweep.Training], at_once: int, stop: sweep.Stop) -> Iterator[tuple[int, int]]:
+        for i, each in enumerate(trainings):
+            words = dict(zip(each.flags, each.flags[1:], strict=False))
+            gamma, seed = (next(w.rpartition("=")[2] for w in each.flags if name in w) for name in ("gamma=", "seed="))
+            new = f"{gamma} {seed} {words['--max_time']}"
+            self.asked.append(f"{new} resumed" if "--resume" in words else new)
+            run = Path(words.get("--load_run", self.folder / f"{gamma}_{seed}"))
+            if gamma + seed == self.breaks:
+                each.log.write_text("train.py: broken\n")
+                yield i, 2
+                continue
+            if not run.exists():
+                write_run(run)
+            if gamma + seed == self.stops:
+                each.log.write_text(said(run, "", "stopped: SIGTERM; go on with\n  train --max_time 37s\n"))
+                yield i, sweep.STOPPED
+                return
+            each.log.write_text(said(run, f"error_vx {abs(float(gamma) - 0.97):.3f}, falls {seed}.000"))
+            yield i, 0
+
+
+HALVE = ["sweep", "--task", "go1_flat", "--halve", "--seeds", "1,2", "--set", "algorithm.gamma=0.9,0.97,0.99,0.8"]
+FIRST = [f"{gamma} {seed} 60s" for gamma in ("0.9", "0.97", "0.99", "0.8") for seed in (1, 2)]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    made = Cluster(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sweep, "run", made.run)
+    return made
+
+
+def halve(monkeypatch: pytest.MonkeyPatch, *more: str, code: int = 0, time: str = "60s") -> None:
+    if code:
+        with pytest.raises(SystemExit, match=str(code)):
+            program(*HALVE, "--max_time", time, *more, monkeypatch=monkeypatch)
+    else:
+        program(*HALVE, "--max_time", time, *more, monkeypatch=monkeypatch)
+
+
+def test_halving_trains_the_best_third_three_times_as_long(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    halve(monkeypatch, "--rounds", "2")
+    second = [f"{gamma} {seed} 180s resumed" for gamma in ("0.97", "0.99") for seed in (1, 2)]
+    assert cluster.asked == [*FIRST, *second]
+    cluster.asked.clear()
+    halve(monkeypatch)  # the third round was left out: one setting goes on alone
+    assert cluster.asked == ["0.97 1 540s resumed", "0.97 2 540s resumed"]
+    cluster.asked.clear()
+    capsys.readouterr()
+    halve(monkeypatch)
+    out = capsys.readouterr().out
+    lines = [line.split()[:3] for line in out.split("\n\n")[0].strip().splitlines()]
+    assert lines[0] == ["gamma", "seed", "rounds"] and not cluster.asked
+    assert lines[1:5] == [["0.97", "1", "3"], ["0.97", "2", "3"], ["0.99", "1", "2"], ["0.99", "2", "2"]]
+    assert out.endswith(
+        "best: gamma=0.97; watch it with\n  legged-mw play --task go1_flat --load_run 0.97_1\n".replace(
+            "0.97_1", str(cluster.folder / "0.97_1")
+        )
+    )
+    halve(monkeypatch, code=2, time="61s")
+    assert "logs/go1_flat_halving holds another sweep, --task go1_flat " in capsys.readouterr().err
+
+
+def test_halving_goes_on_after_a_signal_and_a_failure(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cluster.stops = "0.971"
+    halve(monkeypatch, code=sweep.STOPPED)
+    assert "stopped in round 1; go on with\n  legged-mw sweep --task go1_flat --halve" in capsys.readouterr().out
+    assert cluster.asked == FIRST[:3]
+    cluster.asked, cluster.stops, cluster.breaks = [], "", "0.971"
+    halve(monkeypatch, "--rounds", "2", code=1)
+    assert cluster.asked[0] == "0.97 1 37s resumed" and cluster.asked[6:] == [
+        f"{gamma} {seed} 180s resumed" for gamma in ("0.9", "0.99") for seed in (1, 2)
+    ]  # 0.97 lacks an exam
+    assert "best: gamma=0.99; " in (out := capsys.readouterr().out) and "some failed: " in out
+    for file in (cluster.folder / "logs/go1_flat_halving").glob("round_1_*"):
+        file.write_text("x")
+    cluster.breaks, cluster.run = "", lambda trainings, *_: iter((i, 2) for i in range(len(trainings)))  # type: ignore[method-assign]
+    monkeypatch.setattr(sweep, "run", cluster.run)
+    halve(monkeypatch, code=2)
+    assert "round 1: no training has an exam" in capsys.readouterr().err
+
+
+def test_a_cluster_gets_the_lines_of_a_round(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Eight, of which one fails and notes it; then, of those ranked, the next round's."""
+    halve(monkeypatch, "--print")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 8 and not cluster.asked
+    for line in lines:
+        flags = shlex.split(line.partition(" >> ")[0])[2:]
+        log = cluster.folder / shlex.split(line)[-1]
+        next(cluster.run([sweep.Training("", flags, log)], 1, sweep.Stop()))
+    log.write_text("killed\nfailed: code 137\n")  # 0.8, seed 2
+    halve(monkeypatch, "--print")
+    second = capsys.readouterr().out.splitlines()
+    assert len(second) == 4 and all("--max_time 180s --resume --load_run" in line for line in second)
+    halve(monkeypatch, "--print", "--rounds", "1", code=1)
+    out, err = capsys.readouterr()
+    assert out == "" and "best: gamma=0.97; " in err and "some failed: " in err
 
 
 # ---- completion

@@ -1,7 +1,10 @@
-"""legged-mw sweep --task NAME --seeds 1,2,3 --set a.b=1,2,3: one training after another, and a table of them at the end.
+"""legged-mw sweep --task NAME --seeds 1,2,3 --set a.b=1,2,3: a training for each combination, and a table of them at the end.
 
 Several values, apart by commas, make a training each; of several such fields every combination is trained. A list keeps its
 commas: --set actor.hidden_dims=[64,64],[128,128]. All other flags are those of train.
+
+--halve drops settings early (successive halving): all train for --max_time, then the exam at the end of their training
+ranks them. The best third trains on for three times as long, and so on; the last one trains on alone.
 """
 
 from __future__ import annotations
@@ -11,44 +14,84 @@ import ctypes
 import math
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import product
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import count, product
+from pathlib import Path
 from statistics import mean, stdev
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from legged_mw.rl import flags
 from legged_mw.tools.compare import Run, curves_of, figures, find_runs, rows, text_table
-from legged_mw.utils.cli import Parser, apply_overrides
-from legged_mw.utils.task import load_task
+from legged_mw.utils.cli import Parser, apply_overrides, command, positive
+from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import check_name
+from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training run that a signal ended, from rl/training.py
 TRAIN = [sys.executable, "-m", "legged_mw.programs", "train"]
+THIRD = 3  # one of so many settings goes on, for so many times the time [Li et al. 2018, Hyperband: eta 3 or 4]
+NO_END = ["--max_iterations", "1000000"]  # of a training of --halve, which the time ends
+# figures of the walking exam during training -> whether more is better (eval/rollout.py)
+WALKING = {"error_vx": False, "error_vy": False, "error_yaw": False, "falls": False, "pushes_survived": True}
 _PDEATHSIG = 1  # option of Linux's prctl
-Start = Callable[[list[str]], tuple[int, str, str]]  # flags of train -> exit code, run folder or "", last line
+_POLL = 0.1  # [s]
 
 
 class Cell(NamedTuple):
-    """One training run: its varied fields, field -> value."""
+    """One combination: its varied fields, field -> value."""
 
     varied: dict[str, str]
     flags: list[str]
 
     @property
     def name(self) -> str:
-        return " ".join(f"{path.rpartition('.')[2]}={value}" for path, value in self.varied.items())
+        return _named(self.varied)
+
+    @property
+    def setting(self) -> str:
+        """The name without the seed."""
+        return _named({path: value for path, value in self.varied.items() if path != "seed"})
+
+    @property
+    def label(self) -> str:
+        """The name as a part of a file's name."""
+        return re.sub(r"[^\w.=-]+", "_", self.name).strip("_")
+
+
+def _named(varied: Mapping[str, str]) -> str:
+    return " ".join(f"{path.rpartition('.')[2]}={value}" for path, value in varied.items())
+
+
+class Training(NamedTuple):
+    """A call of ``legged-mw train``, and the file for all that it prints."""
+
+    name: str
+    flags: list[str]
+    log: Path
+
+
+class Printed(NamedTuple):
+    """What a training has printed."""
+
+    folder: str  # of its run, or ""
+    last: str  # the line that says how it ended
+    done: bool
+    left: str  # --max_time to go on with after a signal, or ""
+    exam: dict[str, float]  # figures of the exam at its end
+    failed: bool  # noted by the line of a shell
 
 
 class Stop:
-    """Ends the sweep at a signal. The current training run gets SIGTERM, so that it saves."""
+    """Notes a signal that ends the sweep."""
 
     def __init__(self) -> None:
         self.asked = False
-        self.training: subprocess.Popen[str] | None = None
 
     def listen(self) -> None:
         """Handle Ctrl-C, SIGTERM and SIGHUP, except signals that are ignored, as under nohup."""
@@ -58,10 +101,10 @@ class Stop:
                 signal.signal(number, self)
 
     def __call__(self, *_: object) -> None:
-        first, self.asked = not self.asked, True
-        # send it once: a closing terminal sends SIGHUP twice, and a second SIGTERM would stop the run at once
-        if first and self.training:
-            self.training.terminate()
+        self.asked = True
+
+
+# ---- what is asked
 
 
 def parse() -> tuple[argparse.Namespace, list[str]]:
@@ -72,23 +115,49 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument(
         "--set", action="append", default=[], metavar="PATH=V,V,...", help="a config field and its values"
     )
+    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trainings at a time (default: 1)")
+    parser.add_argument("--halve", action="store_true", help="drop settings early; --max_time is the first round's")
+    rounds = "with --halve: the last round (default: that of the last setting alone)"
+    parser.add_argument("--rounds", type=positive, metavar="N", help=rounds)
+    lines = "start nothing, print the command lines, as for a cluster; with --halve those of the next round"
+    parser.add_argument("--print", action="store_true", help=lines)
     args, rest = parser.parse_known_args()
     for flag in ("--run_name", "--resume", "--load_run", "--list", "--check", "--play"):
-        if any(text.partition("=")[0] == flag for text in rest):
+        if _given(flag, rest):
             parser.error(f"{flag} is of one training: leave it out")
     if not all(re.fullmatch(r"\d+", seed) for seed in values(args.seeds)):
         parser.error(f"--seeds {args.seeds}: write whole numbers apart by commas: --seeds 1,2,3")
+    if args.rounds and not args.halve:
+        parser.error("--rounds is of --halve: add --halve, or leave --rounds out")
+    for flag, field in (("--init", "warm_start.policy"), ("--teacher", "distillation.teacher")):
+        if args.halve and _given(flag, rest):
+            parser.error(f"--halve resumes its trainings, which {flag} does not: write it as --set {field}=RUN")
     return args, rest
+
+
+def _given(flag: str, words: Sequence[str]) -> bool:
+    return any(text.partition("=")[0] == flag for text in words)
 
 
 def main() -> None:
     args, rest = parse()
-    cells = make_cells(args.set, values(args.seeds))
-    check(cells, ["--task", args.task, *rest])
-    print(f"{len(cells)} trainings of {args.task}: {'; '.join(cell.name or 'as it is' for cell in cells)}", flush=True)
-    stop = Stop()
-    stop.listen()
-    found = train_all(cells, ["--task", args.task, *rest], partial(start, stop=stop), stop)
+    cells, common, stop = make_cells(args.set, values(args.seeds)), ["--task", args.task, *rest], Stop()
+    if args.halve:
+        halve(Halving(args, cells, common), args, stop)
+        return
+    check(cells, common)
+    with TemporaryDirectory() as place:
+        trainings = []
+        for i, cell in enumerate(cells):
+            named = ["--run_name", cell.label] if cell.label else []
+            trainings.append(Training(cell.name or "as it is", [*common, *cell.flags, *named], Path(place, f"{i}.txt")))
+        if args.print:
+            print("\n".join(f"{command('train')} {shlex.join(training.flags)}" for training in trainings))
+            return
+        print(f"{len(cells)} trainings of {args.task}: {'; '.join(each.name for each in trainings)}", flush=True)
+        stop.listen()
+        ended = train_all(trainings, args.jobs, stop)
+    found = [(cells[i], find_runs([log.folder])[0]) for i, log in sorted(ended.items())]
     if found:
         print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}")
     if len(found) < len(cells):
@@ -125,68 +194,288 @@ def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
     return cells
 
 
-def check(cells: Sequence[Cell], common: list[str]) -> None:
+def check(cells: Sequence[Cell], common: list[str]) -> tuple[argparse.Namespace, LoadedTask]:
     """Parse all flags and values once, as train does. Raises UserError, or ends the program, for an invalid one."""
     args = flags.parse(None, common)
     args.set += dict.fromkeys(text for cell in cells for text in cell.flags if text != "--set")
-    apply_overrides(load_task(args.task, say=True), args)
+    apply_overrides(task := load_task(args.task, say=True), args)
+    return args, task
 
 
-def train_all(cells: Sequence[Cell], common: list[str], start: Start, stop: Stop) -> list[tuple[Cell, Run]]:
-    """Train all cells. Report and skip a failed run. A signal stops the current run and then the sweep."""
-    found = []
-    for number, cell in enumerate(cells, 1):
-        if stop.asked:
-            break
-        label = re.sub(r"[^\w.=-]+", "_", cell.name).strip("_")
-        code, folder, said = start([*common, *cell.flags, *(["--run_name", label] if label else [])])
-        ended = bool(folder) and code in (0, STOPPED)
-        print(f"{number}/{len(cells)} {cell.name or 'as it is'}: {folder if ended else said}", flush=True)
-        if ended:
-            found.append((cell, find_runs([folder])[0]))
-        if code == STOPPED:
-            break
-    return found
+# ---- trainings in child processes
 
 
-def start(flags: list[str], stop: Stop) -> tuple[int, str, str]:
-    """Run ``legged-mw train`` in a child process that ends with this one. A terminal shows its last line."""
-    folder, said, live = "", "", sys.stdout.isatty()
-    with (
-        tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(
-            [*TRAIN, *flags], stdout=-1, stderr=errors, text=True, errors="replace", preexec_fn=_end_with(os.getpid())
-        ) as process,
-    ):
-        stop.training = process
-        if stop.asked:  # a signal came before the process started
+def train_all(trainings: Sequence[Training], at_once: int, stop: Stop) -> dict[int, Printed]:
+    """Train, and report each as it ends. Returns the logs of those that saved, by number.
+
+    If somebody else stops a training, it stops the sweep too.
+    """
+    ended: dict[int, Printed] = {}
+    for done, (i, code) in enumerate(run(trainings, at_once, stop), 1):
+        log = read_printed(trainings[i].log)
+        saved = bool(log.folder) and code in (0, STOPPED)
+        print(f"{done}/{len(trainings)} {trainings[i].name}: {log.folder if saved else log.last}", flush=True)
+        if saved:
+            ended[i] = log
+        stop.asked |= code == STOPPED
+    return ended
+
+
+def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tuple[int, int]]:
+    """Run ``at_once`` trainings at a time; yields number and exit code of each that ends. A terminal shows a last line.
+
+    After a signal no other begins, and each that runs gets one SIGTERM, so that it saves: a second would end it at once.
+    They are in process groups of their own, since a terminal, or ``timeout``, sends its signal to a whole group. Each has
+    its share of the cores: two that share them slow each other down many times (rl/runner.py, UpdateThreads).
+    """
+    waiting, running, told = list(enumerate(trainings)), dict[int, subprocess.Popen[bytes]](), False
+    shares, uses = shares_of(cores(), at_once), dict[int, int]()
+    try:
+        while running or (waiting and not stop.asked):
+            while waiting and len(running) < at_once and not stop.asked:
+                i, training = waiting.pop(0)
+                uses[i] = min({*range(at_once)} - {uses[other] for other in running})
+                running[i] = _start(training, shares[uses[i]])
+            if stop.asked and not told:
+                told = True
+                for process in running.values():
+                    process.terminate()
+            time.sleep(_POLL)
+            for i, process in list(running.items()):
+                _show(_last_iteration(trainings[i].log))
+                if (code := process.poll()) is not None:
+                    del running[i]
+                    _show("")
+                    yield i, code
+    finally:
+        for process in running.values():  # of a sweep that fails
             process.terminate()
-        assert process.stdout is not None
-        for line in process.stdout:
-            folder = line.removeprefix("writing to ").strip() if line.startswith("writing to ") else folder
-            said = line.strip() if line.startswith("stopped: ") else said
-            if live and line.startswith("Learning iteration"):
-                print(f"\r\x1b[K{line.strip()[:100]}", end="", flush=True)
-        process.wait()
-        stop.training = None
-        errors.seek(0)
-        last = (errors.read().strip().splitlines() or [""])[-1]
-    print("\r\x1b[K" if live else "", end="")
-    return process.returncode, folder, said or last
 
 
-def _end_with(parent: int) -> Callable[[], object] | None:
-    """The first function of a child, so that it gets SIGTERM at any end of ``parent``. None if not on Linux."""
+def cores() -> list[int]:
+    """The cores that this process may use; empty where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def shares_of(cores: Sequence[int], count: int) -> list[Sequence[int]]:
+    """``count`` equal shares, of at least one core if there is any."""
+    size = max(1, len(cores) // count)
+    whole = max(1, len(cores) // size)
+    return [cores[i % whole * size :][:size] for i in range(count)]
+
+
+def _start(training: Training, share: Sequence[int]) -> subprocess.Popen[bytes]:
+    """A child process that ends with this one. Called from the main thread, for ``preexec_fn``."""
+    with open(training.log, "ab") as log:  # one that is killed at once keeps what was there
+        return subprocess.Popen(
+            [*TRAIN, *training.flags],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            process_group=0,
+            preexec_fn=_first(os.getpid(), share),
+        )
+
+
+def _first(parent: int, share: Sequence[int]) -> Callable[[], object] | None:
+    """The first function of a child: it takes its cores, and gets SIGTERM at any end of ``parent``. None if not on Linux."""
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
 
     def first() -> None:
         prctl(_PDEATHSIG, int(signal.SIGTERM))
+        os.sched_setaffinity(0, share)
         if os.getppid() != parent:  # the parent has already ended
             os._exit(1)
 
     return first
+
+
+def _show(line: str) -> None:
+    """On a terminal, in place of the line before."""
+    if sys.stdout.isatty():
+        print(f"\r\x1b[K{line[:100]}", end="", flush=True)
+
+
+def _last_iteration(log: Path) -> str:
+    with open(log, "rb") as file:
+        file.seek(max(0, log.stat().st_size - 1000))
+        lines = re.findall(r"^Learning iteration .*$", file.read().decode(errors="replace"), re.M)
+    return lines[-1] if lines else ""
+
+
+def read_printed(file: Path) -> Printed:
+    """What is known of a training from what it printed, at one start after the other; all empty without the file."""
+    text = file.read_text(errors="replace").strip() if file.is_file() else ""
+
+    def last(pattern: str) -> str:
+        found = re.findall(pattern, text, re.M)
+        return found[-1] if found else ""
+
+    done = bool(last(r"^done: "))
+    exam = re.findall(r"(\w+) (-?\d+\.\d+)", last(r"^exam after \d+ iterations: (.*)$"))
+    return Printed(
+        folder=last(r"^writing to (.*)$"),
+        last=last(r"^(stopped: .*)\n.*\Z") or text.rpartition("\n")[2],
+        done=done,
+        left=last(r"^stopped: .*\n.* --max_time (\S+)$"),
+        exam={name: float(value) for name, value in exam if done},
+        failed=bool(last(r"^failed: code (?!3$)")),
+    )
+
+
+# ---- successive halving
+
+
+class Halving:
+    """The rounds of a sweep. All that is known of them is what the trainings have printed, into files of ``folder``."""
+
+    def __init__(self, args: argparse.Namespace, cells: Sequence[Cell], common: list[str]) -> None:
+        """Raises UserError if the sweep cannot be halved, or ``folder`` holds another one."""
+        asked, self.task = check(cells, common)
+        if len({cell.setting for cell in cells}) < 2:
+            raise UserError("--halve chooses between settings, and there is one: give several values, --set PATH=V,V,V")
+        if not asked.max_time:
+            raise UserError("--halve needs the time of the first round: --max_time 60s")
+        if not self.task.exam or self.task.train.runner.exam_interval <= 0:
+            why = (
+                f"task '{self.task.name}' has none" if not self.task.exam else "runner.exam_interval = 0 leaves it out"
+            )
+            raise UserError(f"--halve ranks by the exam at the end of a training, and {why}")
+        self.cells, self.seconds = {cell.label: cell for cell in cells}.values(), asked.max_time
+        name = check_name(asked.experiment_name or f"{self.task.name}_halving", "--experiment_name")
+        self.folder = Path.cwd() / "logs" / name
+        self.common = [*NO_END, *common, "--experiment_name", name]
+        settings = [text for item in args.set for text in ("--set", item)]
+        self._claim(shlex.join([*common, *settings, "--seeds", args.seeds]))
+
+    def _claim(self, sweep: str) -> None:
+        note = self.folder / "sweep.txt"
+        before = note.read_text(encoding="utf-8") if note.is_file() else sweep
+        if before != sweep:
+            raise UserError(f"{shown(self.folder)} holds another sweep, {before}; name yours with --experiment_name")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        note.write_text(sweep, encoding="utf-8")
+
+    def file(self, cell: Cell, number: int) -> Path:
+        return self.folder / f"round_{number}_{cell.label}.txt"
+
+    def log(self, cell: Cell, number: int) -> Printed:
+        return read_printed(self.file(cell, number))
+
+    def training(self, cell: Cell, number: int) -> Training:
+        """The training of round ``number``: a new run in the first one; a run that a signal stopped gets the time left."""
+        begun, before = self.log(cell, number), self.log(cell, number - 1)
+        run = begun.folder if begun.left else before.folder
+        words = ["--max_time", begun.left or f"{self.seconds * THIRD ** (number - 1):g}s"]
+        words += ["--resume", "--load_run", run] if run else ["--run_name", cell.label]
+        return Training(cell.name, [*self.common, *cell.flags, *words], self.file(cell, number))
+
+    def line(self, cell: Cell, number: int) -> str:
+        """``training`` for a shell, which notes a failure in the file: the line is not printed again."""
+        training = self.training(cell, number)
+        file = shlex.quote(shown(training.log))
+        return f"{command('train')} {shlex.join(training.flags)} >> {file} 2>&1 || echo failed: code $? >> {file}"
+
+    def rounds(self, cell: Cell) -> int:
+        """How many rounds its training has done."""
+        return next(number for number in count() if not self.log(cell, number + 1).done)
+
+    def last(self, cell: Cell) -> Printed:
+        """The log of the last round that is done."""
+        return self.log(cell, self.rounds(cell))
+
+    def found(self, places: Sequence[str]) -> list[tuple[Cell, Run]]:
+        """All that have done a round, with their number of rounds; the best setting first."""
+        cells = sorted(self.cells, key=lambda cell: places.index(cell.setting))
+        return [
+            (cell._replace(varied={**cell.varied, "rounds": str(self.rounds(cell))}), find_runs([log.folder])[0])
+            for cell in cells
+            if (log := self.last(cell)).done
+        ]
+
+
+def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
+    """Train round after round. Rounds that are done, of an earlier call or by a cluster, are not trained again."""
+    places, failed = list(dict.fromkeys(cell.setting for cell in halving.cells)), False
+    left, better = places, ranked_figures(halving.task.exam)
+    out = sys.stderr if args.print else sys.stdout  # a shell runs what --print prints
+    stop.listen()
+    for number in count(1):
+        able = [cell for cell in halving.cells if cell.setting in left and halving.rounds(cell) >= number - 1]
+        todo = [cell for cell in able if halving.rounds(cell) < number]
+        if args.print and (
+            lines := [halving.line(cell, number) for cell in todo if not halving.log(cell, number).failed]
+        ):
+            print("\n".join(lines))
+            print(f"round {number}; when these have ended, the same command prints the next", file=out)
+            return
+        if todo and not args.print:
+            print(f"round {number}: {', '.join(left)}; to train: {len(todo)}", flush=True)
+            train_all([halving.training(cell, number) for cell in todo], args.jobs, stop)
+        if stop.asked:
+            break
+        exams = {name: [halving.log(cell, number).exam for cell in able if cell.setting == name] for name in left}
+        failed |= any(halving.rounds(cell) < number for cell in able)
+        if not any(exam for each in exams.values() for exam in each):
+            raise UserError(f"round {number}: no training has an exam; what they said is in {shown(halving.folder)}")
+        ranked = rank(exams, better)
+        places = [*ranked, *(name for name in places if name not in ranked)]
+        if len(left) == 1 or number == args.rounds:
+            break
+        left = ranked[: math.ceil(len(ranked) / THIRD)]
+    if found := halving.found(places):
+        print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}", file=out)
+    if stop.asked:
+        print(f"stopped in round {number}; go on with\n  {command('sweep')} {shlex.join(sys.argv[1:])}")
+        raise SystemExit(STOPPED)
+    runs = {
+        log.folder: [log.exam]
+        for cell in halving.cells
+        if cell.setting == places[0] and (log := halving.last(cell)).done
+    }
+    watch = shlex.join(["--task", args.task, "--load_run", rank(runs, better)[0]])
+    print(f"best: {places[0]}; watch it with\n  {command('play')} {watch}", file=out)
+    if failed:
+        print(f"some failed: what they said is in {shown(halving.folder)}; without --print they train again", file=out)
+        raise SystemExit(1)
+
+
+def ranked_figures(exam: str) -> dict[str, bool]:
+    """The figures with a mark of the exam during training -> whether more is better."""
+    from legged_mw.eval.skills import SKILLS  # imports MuJoCo
+
+    if exam not in SKILLS:
+        return WALKING
+    return {measure.key: measure.more_is_better for measure in SKILLS[exam].measures if measure.marks}
+
+
+def rank(exams: Mapping[str, Sequence[Mapping[str, float]]], better: Mapping[str, bool]) -> list[str]:
+    """Names, best first: by their place in each figure, averaged over the figures. Those that lack an exam come last.
+
+    ``exams``: name -> figures of each of its trainings, empty without an exam; a figure counts by its mean.
+    """
+    most = max(len(each) for each in exams.values())
+    worth: dict[str, list[float]] = {}  # of each figure: more is better, -inf if nobody has it
+    for name, each in exams.items():
+        means = [
+            mean(exam.get(figure, math.nan) for exam in each if exam) if any(each) else math.nan for figure in better
+        ]
+        signed = [value if more else -value for value, more in zip(means, better.values(), strict=True)]
+        worth[name] = [-math.inf if math.isnan(value) else value for value in signed]
+
+    def order(name: str) -> tuple[int, float]:
+        ahead = [
+            sum((their > own) + 0.5 * (their == own) for their in column)
+            for own, column in zip(worth[name], zip(*worth.values(), strict=True), strict=True)
+        ]
+        return most - sum(map(bool, exams[name])), mean(ahead)
+
+    return sorted(exams, key=order)
+
+
+# ---- the table
 
 
 def table(found: Sequence[tuple[Cell, Run]]) -> str:
@@ -194,18 +483,18 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
     fields = list(dict.fromkeys(path for cell, _ in found for path in cell.varied))
     (_, *heads), *lines = rows(runs := [run for _, run in found])
     short = [path.rpartition(".")[2] for path in fields]
-    settings = [[cell.varied.get(path, "") for path in fields] for cell, _ in found]
-    cells = [[*setting, *line] for setting, (_, *line) in zip(settings, lines, strict=True)]
+    settings = [{path: cell.varied.get(path, "") for path in fields} for cell, _ in found]
+    cells = [[*setting.values(), *line] for setting, (_, *line) in zip(settings, lines, strict=True)]
     means = []
     if "seed" in fields:
         groups: dict[tuple[str, ...], list[int]] = {}
         for i, setting in enumerate(settings):
-            groups.setdefault(tuple(setting[:-1]), []).append(i)
+            groups.setdefault(tuple({**setting, "seed": ""}.values()), []).append(i)
         columns = figures(runs).values()
-        for group, of in groups.items():
+        for of in groups.values():
             if len(of) > 1:
                 figured = [_mean(digits, [values[i] for i in of]) for digits, values in columns]
-                means.append([*group, f"mean of {len(of)}", *figured])
+                means.append([*{**settings[of[0]], "seed": f"mean of {len(of)}"}.values(), *figured])
     return text_table([[*short, *heads], *cells, *means])
 
 

@@ -193,10 +193,16 @@ def fail(program: str, message: str) -> NoReturn:
 
 
 def command(program: str, processes: int = 1) -> str:
-    """How the user starts ``train`` or ``play``: ``python train.py`` in a clone, else ``legged-mw train``."""
+    """How the user starts ``train`` or ``play``: ``python train.py`` in a clone, else ``legged-mw train``.
+
+    ``processes`` of torchrun; on several nodes, which torchrun counts in ``GROUP_WORLD_SIZE``, N is the node's number.
+    """
     installed = Path(sys.argv[0]).name.startswith("legged-mw")
     if processes > 1:
         script = f"-m legged_mw.programs {program}" if installed else f"{program}.py"
+        if (nodes := int(os.environ.get("GROUP_WORLD_SIZE", "1"))) > 1:
+            where = f"--nnodes={nodes} --node_rank=N --master_addr={os.environ.get('MASTER_ADDR', 'HOST')}"
+            return f"torchrun {where} --nproc_per_node={processes // nodes} {script}"
         return f"torchrun --nproc_per_node={processes} {script}"
     return f"legged-mw {program}" if installed else f"python {program}.py"
 

@@ -37,15 +37,21 @@ MOTION = [
 MOTION += [f"{WAVE} --task go1_flat", f"{WAVE} --lift nan", f"{WAVE} --task nosuch", "words.csv", "narrow.csv"]
 COMPARE = ["", "nosuch", "nosuch --over days", "nosuch --out a.html", "a/../b"]
 SWEEP = ["", "--task go1_flat --resume", "--task go1_flat --seeds 1,x", "--task go1_flat --run_name a"]
+SWEEP += ["--task go1_flat --rounds 2", "--task go1_flat --jobs 0", "--task go1_flat --halve --init a"]
+SWEEP += ["--task go1_flat --halve --seeds 1,2 --max_time 60s"]
+GAMMAS = "--task go1_flat --halve --set algorithm.gamma=0.9,0.97"
+SWEEP += [GAMMAS, f"{GAMMAS} --max_time 60s", f"{GAMMAS} --max_time 60s --set runner.exam_interval=0"]
 
 
 def fill(root: Path) -> None:
-    (root / "folder").mkdir()
+    for name in ("folder", "logs/go1_flat_halving"):
+        (root / name).mkdir(parents=True)
     for name, text in {
         "there.xml": "",
         "folder/there.xml": "",
         "words.csv": "a,b\nc,d\n",
         "narrow.csv": "1,2,3\n4,5,6\n",
+        "logs/go1_flat_halving/sweep.txt": "--task go1_flat --seeds 1,2",
     }.items():
         (root / name).write_text(text)
 
