@@ -306,7 +306,7 @@ def measure(name: str, device: str, seconds: float, worlds: int = 0) -> Speed:
     with contextlib.redirect_stdout(io.StringIO()), peak.watched() if device != "cpu" else contextlib.nullcontext():
         env = task.env_class(task.cfg, device)
         runner = make_runner(env, task.train, None, device)
-        runner.learn(5 if device != "cpu" else 1)  # warm-up: recording, choice of the number of threads
+        runner.learn(5 if device != "cpu" else 3)  # warm-up: recording; on a CPU a trial of one thread and of all
     start, done = time.perf_counter(), 0
     with contextlib.redirect_stdout(io.StringIO()):
         while done == 0 or time.perf_counter() < begun + 0.8 * seconds:
