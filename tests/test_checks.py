@@ -304,6 +304,7 @@ def test_episodes_of_one_step_are_said_once_after_a_resume_too() -> None:
 
 def test_a_robot_that_stands_after_a_quarter_of_its_training_is_said_once() -> None:
     numbers = {"episodes": 0.0, "episode_length": 1e3, "falls_a_minute": 0.2, "rew_pose": 1.0, "rew_torques": -0.3}
+    numbers["rew_termination"] = -9.0  # no advice: it is falling that costs
     for walked, falls, what in ((0.1, 0.2, "weaken torques"), (0.1, 7.0, "falls 7 times"), (0.3, 7.0, "")):
         health = FiniteCheck([], [])
         asked = numbers | {"rew_energy": -0.1, "walked": walked, "falls_a_minute": falls}
@@ -313,6 +314,9 @@ def test_a_robot_that_stands_after_a_quarter_of_its_training_is_said_once() -> N
         )
     health = FiniteCheck([], [])
     assert not any(health.lengths(numbers) or health.walking(numbers, 0.5) for _ in range(99)), "not told to walk"
+    health, stands = FiniteCheck([], []), numbers | {"walked": 0.1, "command_share": 1.0}
+    said = [(k, line) for k in range(99) for line in (health.lengths(stands), health.walking(stands, 0.5))[1]]
+    assert [k for k, _ in said] == [19] and "curriculum" not in said[0][1], "it is on"
 
 
 @pytest.mark.parametrize(("kp", "what"), [("0", "sags"), ("25000", "unstable")])

@@ -561,6 +561,10 @@ def test_sliders_have_the_trained_limits_and_drive() -> None:
     page.build()
     pilot.listen()
     assert np.allclose(pilot.command, [0.25, -0.3, 0.25])  # the others stay as the robot follows them
+    page.steer(0, 0.5)
+    page.steer(2, -0.1)  # two fingers, before the session's next turn
+    pilot.listen()
+    assert np.allclose(pilot.command, [0.5, -0.3, -0.1])
     ui.dragged = {"push [m/s]": 2.5}
     page.build()
     assert pilot.push_speed == 2.5

@@ -392,7 +392,8 @@ class FiniteCheck:
         self._looked = True
         if walked >= WALKS:
             return []
-        penalties = {name[4:]: value for name, value in numbers.items() if name.startswith("rew_") and value < 0.0}
+        found = {name[4:]: value for name, value in numbers.items() if name.startswith("rew_") and value < 0.0}
+        penalties = {name: value for name, value in found.items() if name != "termination"}
         largest = min(penalties, key=lambda name: penalties[name], default="")
         advice = (
             f"raise rewards.scales.tracking_lin_vel{f', or weaken {largest}, the largest penalty' if largest else ''}"
@@ -400,7 +401,8 @@ class FiniteCheck:
         if (falls := numbers["falls_a_minute"]) > OFTEN:
             advice = f"it falls {falls:.0f} times a minute: weaken perturbation and domain_rand"
         said = f"after {done:.0%} of the training it walks {walked:.0%} of the command: it stands"
-        return [f"{said}; {advice}, set commands.curriculum = True, or train longer"]
+        slowly = "" if "command_share" in numbers else ", set commands.curriculum = True"
+        return [f"{said}; {advice}{slowly}, or train longer"]
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
         """Name -> count above 0; of a row with several columns, the largest."""

@@ -120,6 +120,16 @@ class Pilot:
         wanted = np.array(command, dtype=np.float64)
         self._asked.put(lambda: self._steer(wanted))
 
+    def steer_one(self, column: int, value: float, own: FloatArray) -> None:
+        """Drive by the command, at first the robot's `own` (C,), with `value` in this column, from the next turn on."""
+
+        def change() -> None:
+            wanted = np.array(self.command if self.driving else own)
+            wanted[column] = value
+            self._steer(wanted)
+
+        self._asked.put(change)
+
     def push(self, velocity: ArrayLike | None = None) -> None:
         """Push the driven robots by `velocity` (2,) [m/s], world frame. None: `push_speed` in a random direction."""
         added = None if velocity is None else np.array(velocity, dtype=np.float64)

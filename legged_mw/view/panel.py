@@ -108,9 +108,7 @@ class Panel:
     def steer(self, column: int, value: float) -> None:
         """Drive by the shown commands with `value` in this column."""
         if "own" in self.pilot.can and self.moment is not None:
-            command = self._command(self.moment)
-            command[column] = value
-            self.pilot.steer(command)
+            self.pilot.steer_one(column, value, self._command(self.moment))
 
     def set_push(self, speed: float) -> None:
         """Set the speed [m/s] of a push."""

@@ -40,13 +40,20 @@ GIF_FPS, GIF_WIDTH = 12.5, 640  # GIF times are in 0.01 s; larger values make la
 class RobotRenderer:
     """Offscreen pictures of robots from a camera that follows one. Use it only on the thread that created it.
 
-    `live`: fast on a CPU, without shadows and smooth edges; and `move_camera` turns the camera.
+    `robots`: a model of one, of which `count` are drawn; or posed ones, which it changes. `live`: fast on a CPU, without
+    shadows and smooth edges; and `move_camera` turns the camera.
     """
 
     def __init__(
-        self, spec: mujoco.MjSpec, width: int = 1280, height: int = 720, count: int = 1, *, live: bool = False
+        self,
+        robots: mujoco.MjSpec | PosedRobots,
+        width: int = 1280,
+        height: int = 720,
+        count: int = 1,
+        *,
+        live: bool = False,
     ) -> None:
-        self.robots = PosedRobots(spec, count)
+        self.robots = robots if isinstance(robots, PosedRobots) else PosedRobots(robots, count)
         vis = self.robots.model.vis
         if live:
             vis.quality.offsamples, vis.quality.numslices, vis.quality.numstacks = LIVE

@@ -7,6 +7,7 @@ so a slow link gets fewer of them. One thread draws them all, with a camera of i
 from __future__ import annotations
 
 import asyncio
+import copy
 import io
 import json
 import os
@@ -24,6 +25,7 @@ import mujoco
 
 from legged_mw.view.drive import ACTIONS
 from legged_mw.view.panel import Panel
+from legged_mw.view.posed_robot import PosedRobots
 from legged_mw.view.recorder import RobotRenderer
 from legged_mw.view.stage import ViewError
 
@@ -35,6 +37,7 @@ QUALITY = 80  # ours: of the JPEGs, of 100; about 18 kB each
 VIDEO_FPS = 25.0  # the camera's filters count in frames of a video
 WATCHERS = 9  # pages at most, as Studio's own limit
 MESSAGE, MOST = 200, 100.0  # a page's request at most: its length, a number in it
+SILENT = 10.0  # [s] without a request: a page asleep or gone; it watches no more, so that another may drive
 NEXT = "next"  # a page's request for one more picture
 # codes of closing: Studio's for a page that may not drive and for one too many, WebSocket's for a bad request
 TAKEN, FULL, BAD = 4001, 4002, 1008
@@ -45,14 +48,16 @@ Handler = Callable[[Any], Awaitable[None]]
 class Stream:
     """Pictures, numbers and requests of the pages at `/stream`. The first page that came drives, of either kind."""
 
-    def __init__(self, spec: mujoco.MjSpec, panel: Panel, count: int) -> None:
-        self._spec, self._panel, self._count = spec, panel, count
+    def __init__(self, robots: PosedRobots, panel: Panel) -> None:
+        self._robots, self._panel = copy.deepcopy(robots), panel  # compiling them would stop the session
         self._artist = ThreadPoolExecutor(1, "artist", _step_back)  # an OpenGL context belongs to one thread
         self._renderer: RobotRenderer | None = None  # made for the first page that asks
         self._picture, self._drawn = b"", 0.0  # the last JPEG, its time [s]
         self._moves: deque[tuple[int, float, float]] = deque(maxlen=100)  # of the camera, for the next picture
-        self._studio: list[str] = []  # session of each Studio page that drives or waits for it to be free
-        self._watching: list[Any] = []  # sockets that asked for pictures
+        self._studio: list[tuple[Any, str]] = []  # Studio's sockets /ui with their sessions
+        self._watching: dict[
+            Any, float
+        ] = {}  # sockets that asked for pictures, in this order: time of the last request
 
     def around(self, studio: Handler) -> Handler:
         """Studio's handler of WebSockets, with `/stream` beside it. While a page of ours drives, no page of Studio's does."""
@@ -65,24 +70,28 @@ class Stream:
                     await self._serve(socket, query)
             elif path != "/ui":
                 await studio(socket)
-            elif self._watching and not self._studio:
+            elif self._first() is not None and self._controller() is None:
                 await socket.close(TAKEN, "another browser drives")
             else:
-                self._studio.append(query)
+                self._studio.append((socket, query))
                 try:
                     await studio(socket)
                 finally:
-                    self._studio.remove(query)
+                    self._studio.remove((socket, query))
 
         return handle
 
     def close(self) -> None:
         """Free the OpenGL context. May be called twice."""
+        with suppress(RuntimeError):  # the interpreter ends, or it is closed already
+            self._artist.submit(self._free)
+        self._artist.shutdown()
+
+    def _free(self) -> None:
+        """Free the OpenGL context, on the artist's thread: a picture may just have made it."""
         renderer, self._renderer = self._renderer, None
-        with suppress(RuntimeError):  # the interpreter ends
-            if renderer is not None:
-                self._artist.submit(renderer.close)
-            self._artist.shutdown()
+        if renderer is not None:
+            renderer.close()
 
     async def _serve(self, socket: Any, session: str) -> None:
         """Answer one page until it leaves or asks for what there is not."""
@@ -96,17 +105,31 @@ class Stream:
                 if sender is None and len(self._watching) >= WATCHERS:
                     await socket.close(FULL, f"{WATCHERS} browsers watch already")
                 elif sender is None:
-                    self._watching.append(socket)
+                    self._watching[socket] = time.monotonic()
                     sender = asyncio.create_task(self._send(socket, asked))
+                if sender is not None:
+                    self._watching[socket] = time.monotonic()
                 asked.release()
         finally:
             if sender is not None:
-                self._watching.remove(socket)
+                del self._watching[socket]
                 sender.cancel()
 
     def _drives(self, socket: Any, session: str) -> bool:
         """Whether this page drives. Of Studio's pages it is the one that Studio has accepted."""
-        return session == self._studio[0] if self._studio else socket in self._watching[:1]
+        controller = self._controller()
+        return socket is self._first() if controller is None else session == controller
+
+    def _controller(self) -> str | None:
+        """The session of the first page of Studio's that it has not refused."""
+        from websockets.protocol import State
+
+        return next((session for each, session in self._studio if each.state is State.OPEN), None)
+
+    def _first(self) -> Any:
+        """The first page of ours that still asks for pictures."""
+        now = time.monotonic()
+        return next((each for each, last in self._watching.items() if now - last < SILENT), None)
 
     async def _send(self, socket: Any, asked: asyncio.Semaphore) -> None:
         """Send the panel's numbers and a picture for each request that `asked` counts."""
@@ -138,7 +161,7 @@ class Stream:
             except ImportError as error:  # on a robot's computer
                 raise ViewError(f"its JPEGs are written by Pillow ({error}): pip install pillow") from None
             if self._renderer is None:
-                self._renderer = RobotRenderer(self._spec, WIDTH, HEIGHT, self._count, live=True)
+                self._renderer = RobotRenderer(self._robots, WIDTH, HEIGHT, live=True)
             while self._moves:
                 self._renderer.move_camera(*self._moves.popleft())
             frame = self._renderer.frame(moment._replace(lines=()), (now - self._drawn) * VIDEO_FPS)
@@ -155,7 +178,7 @@ class Stream:
         panel, request = self._panel, _request(message)
         match request:
             case ["press", str(key)]:
-                act = partial(panel.press, key, studio=bool(self._studio))
+                act = partial(panel.press, key, studio=self._controller() is not None)
             case ["click", str(action)] if action in ACTIONS:
                 act = partial(panel.click, action)
             case ["steer", int(column), float(value) | int(value)] if 0 <= column < len(panel.pilot.table):

@@ -72,7 +72,7 @@ class WebViewer:
                 f"--viewer web: this process serves {WebViewer._serving} already, and MuJoCo's web viewer can be there once: close it first"
             )
         self._plugin, gate = StudioPlugin(self.robots, pilot, title), Gate(host, port)
-        self._stream = Stream(spec, self._plugin.panel, count)
+        self._stream = Stream(self.robots, self._plugin.panel)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
         with _bound_to(host, gate, self._stream):
             self._handle: Any = launch_web.launch(config, plugins=[self._plugin])
