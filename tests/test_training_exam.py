@@ -68,7 +68,9 @@ def test_advice_names_what_is_beyond_the_marks() -> None:
     assert can.count(";") >= 4 and cannot == "it cannot: -" and "--eval" in after
     can, cannot, after = rules.advise([vx, 2.0 * vy, yaw], 3.0, 0.5)
     assert "follow vy" in cannot and "stand at" in cannot and "pushes" in cannot and "--resume" in after
-    assert "follow vx" in can and "follow yaw" in can
+    assert "follow vx" in can and "follow yaw" in can and "perturbation.velocity" in after
+    *_, after = rules.advise([vx, vy, yaw], 0.0, 0.5)
+    assert "perturbation.velocity" not in after  # no fall: weaker kicks would not help
 
 
 def test_no_exam_for_an_actor_that_sees_what_the_nominal_world_has_not(capsys: pytest.CaptureFixture[str]) -> None:

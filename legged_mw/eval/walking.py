@@ -304,10 +304,10 @@ class ExamRules:
         can, cannot = ([what for what, is_able in able.items() if is_able is asked] for asked in (True, False))
         if not cannot:
             after = "play.py --eval, the whole exam and the hard one"
-        elif falls or survived < 1.0:
+        elif falls:
             after = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
         else:
-            after = "train longer with --resume; play.py --eval says at which commands it is off"
+            after = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
         return [
             f"it can: {'; '.join(can) or 'nothing yet'}",
             f"it cannot: {'; '.join(cannot) or '-'}",

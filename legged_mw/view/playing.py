@@ -95,7 +95,7 @@ def parse(description: str | None) -> argparse.Namespace:
     )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument(
-        "--no_hard", action="store_true", help="--eval without the hard exam and heat, in half the time"
+        "--no_hard", action="store_true", help="--eval without the hard exam and heat, in two thirds of the time"
     )
     parser.add_argument(
         "--export",
