@@ -151,7 +151,7 @@ def test_an_installed_package_drafts_a_task(installed: Path, tmp_path: Path) -> 
 
 
 def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
-    names = "train, play, deploy, exam, robot, motion, doctor, compare, sweep, warm, completion"
+    names = "train, play, deploy, exam, fit, robot, motion, doctor, compare, sweep, warm, completion"
     for words, said in (
         ([], f"there are: {names}"),
         (["trian"], f"no program 'trian', did you mean 'train'? there are: {names}"),

@@ -83,12 +83,17 @@ def same(a: Tensor, b: Tensor) -> bool:
 
 
 def changed(env: LeggedRobot, before: Mapping[str, Tensor], worlds: Tensor | None = None) -> list[str]:
-    """Names of tensors that differ from ``before``; with ``worlds`` (bool mask), in those rows of a tensor that has a row a world."""
+    """Names of tensors that differ from ``before``; with ``worlds`` (bool mask), in these worlds where a tensor has a row for each.
+
+    A command's past has its worlds second, after the frames.
+    """
     now = tensors(env)
     assert now.keys() == before.keys()
     n = env.num_envs
 
     def part(tensor: Tensor) -> Tensor:
+        if worlds is not None and tensor.dim() == 3 and tensor.shape[0] != n and tensor.shape[1] == n:
+            return tensor[:, worlds]
         return tensor[worlds] if worlds is not None and tensor.dim() and tensor.shape[0] == n else tensor
 
     return [name for name in now if not same(part(now[name]), part(before[name]))]
