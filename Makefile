@@ -21,7 +21,7 @@ play: $(VENV)/ready
 	$(BIN)/python play.py --task $(TASK) $(ARGS)
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # the two words after `net` are no targets
 ifeq ($(firstword $(MAKECMDGOALS)),net)

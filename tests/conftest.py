@@ -55,8 +55,15 @@ def has_browser() -> bool:
     return shutil.which("chromium") is not None and find_spec("playwright") is not None
 
 
+LONG = ("test_suite", "test_error_lines", "test_tutorial", "test_unitree_guard", "test_your_own_robot", "test_ranks")
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect, not skip: `pytest -m gpu` on a machine without a GPU then says that nothing ran."""
+    """Deselect, not skip: `pytest -m gpu` on a machine without a GPU then says that nothing ran.
+
+    Files that take half a minute and more come first, or at the end one core waits for the other.
+    """
+    items.sort(key=lambda item: item.path.stem not in LONG)
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     for mark, present in (
         ("gpu", gpus > 0),
