@@ -18,7 +18,7 @@ from legged_mw.deploy.inputs import InputSource
 from legged_mw.deploy.joint_check import JointCheck, Moves
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits
-from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.simulated import DeployScene
 from legged_mw.deploy.states import CHIRP, Order
 
 SECONDS = 58.0  # [s] ours: of all sweeps together
@@ -59,7 +59,7 @@ class Chirp(JointCheck):
         super().__init__(controller, sources, say, robot, limits)
         self._now, self._swept = 0.0, 0
         self._pose = controller.contract.default_pose
-        self.amplitude, self.highest = _extent(controller, limits)  # (D,) [rad], [Hz]
+        self.amplitude, self.highest = _extent(controller.contract, self._scene, limits)  # (D,) [rad], [Hz]
         ratings = controller.contract.ratings
         top = SPEED * ratings.top_speed if ratings else np.full(len(self.joints), np.nan)
         self._speed = np.fmin(FASTEST, top)  # (D,) [rad/s] of a target
@@ -115,10 +115,8 @@ class Chirp(JointCheck):
         return Order(CHIRP, targets, contract.stiffness, contract.damping)
 
 
-def _extent(controller: Controller, limits: Limits) -> tuple[Floats, Floats]:
+def _extent(contract: Contract, scene: DeployScene, limits: Limits) -> tuple[Floats, Floats]:
     """Amplitude (D,) [rad] and highest frequency (D,) [Hz] of each joint's sweep, by the contract's limits."""
-    contract = controller.contract
-    scene = read_scene(controller.folder, contract)
     data, inertia = mujoco.MjData(scene.model), np.zeros((scene.model.nv, scene.model.nv))
     mujoco.mj_resetDataKeyframe(scene.model, data, 0)
     mujoco.mj_forward(scene.model, data)

@@ -73,6 +73,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _checks_joints(args: argparse.Namespace) -> bool:
+    return args.check_joints or args.first_walk or args.chirp
+
+
 def check_flags(args: argparse.Namespace) -> None:
     """Refuse flags that do not go together. Raises FlagError or LimitError."""
     others = [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]
@@ -82,7 +86,7 @@ def check_flags(args: argparse.Namespace) -> None:
         raise FlagError(f"--chirp moves one joint of a robot at a time, after a joint check: leave --{others[0]} out")
     if args.first_walk and (others := others + [n for n in ("check_joints", "chirp") if getattr(args, n)]):
         raise FlagError(f"--first_walk is a list with commands and a joint check of its own: leave --{others[0]} out")
-    args.drive |= args.check_joints or args.first_walk or args.chirp
+    args.drive |= _checks_joints(args)
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
     shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
     watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
@@ -103,15 +107,13 @@ def check_flags(args: argparse.Namespace) -> None:
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     """True if a simulated robot begins on a hoist."""
-    checked = args.check_joints or args.first_walk or args.chirp
+    checked = _checks_joints(args)
     return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or checked))
 
 
 def lift(args: argparse.Namespace) -> float:
     """Height [m] of the hoisted robot above its start."""
-    return LIFT * (
-        args.hoist == "high" or (args.hoist is None and (args.check_joints or args.first_walk or args.chirp))
-    )
+    return LIFT * (args.hoist == "high" or (args.hoist is None and _checks_joints(args)))
 
 
 def drive(

@@ -1,8 +1,8 @@
 """A robot's own numbers from the log of its chirp: delay, armature, friction, damping, gain and encoder offset a joint.
 
 Each joint's sweep is replayed in MuJoCo's C engine with what hangs on it. The root moves as the IMU felt it, and the
-other joints as they were measured, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers with which angles
-and speeds are nearest to those measured.
+other joints as they were measured, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers
+with which angles and speeds are nearest to those measured.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from legged_mw.utils.machine import usable_cores
 ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
 HEAVY = 1e6  # [kg], [kg m^2] ours: of a root and of joints that move as they are told
 SMOOTH = 9  # ours: measurements in a mean of a speed, before its slope is taken
-EXPECTED = (0.1, 0.01)  # [-], [rad] ours: how far gain and encoder are off where nothing shows it; two more errors
+EXPECTED = (0.1, 0.01)  # [-], [rad] ours: gain and encoder are right within this where no motion shows more
 TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
 BLOCK = 50  # ours: measurements in a row whose errors may be alike
 NOISE = 1.5  # ours: a residual so small is noise, and no other start is followed

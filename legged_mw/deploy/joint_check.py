@@ -65,7 +65,7 @@ class JointCheck(States):
         rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[JointResult]()
         super().__init__(controller, sources, lambda _: rest, say)
         self.joints, self._limits, self._motors, self._moves = controller.contract.joints, limits, robot.motors, None
-        self._model = read_scene(controller.folder, controller.contract).model
+        self._scene = read_scene(controller.folder, controller.contract)
 
     @property
     def over(self) -> bool:
@@ -175,7 +175,7 @@ class JointCheck(States):
 
         Its centre of mass must stay below the rope.
         """
-        model, data, centres = self._model, mujoco.MjData(self._model), []
+        model, data, centres = self._scene.model, mujoco.MjData(self._scene.model), []
         for measured in (before, there):
             data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)  # body frame, as gravity is
             data.qpos[[model.joint(name).qposadr[0] for name in self.joints]] = measured.joint_pos

@@ -333,7 +333,7 @@ OFTEN = 3.0  # ours: falls a minute, from which on falling is what keeps it from
 
 
 class FiniteCheck:
-    """Warns of values that are not finite, and says when a training must end for them."""
+    """Warns of values that are not finite, of short episodes and of robots that stand; says when a training must end."""
 
     def __init__(self, names: Sequence[str], stored: Sequence[str]) -> None:
         """``names`` of the values that the step counts; ``stored``: names of the columns that an update reads."""

@@ -55,9 +55,7 @@ class Stream:
         self._picture, self._drawn = b"", 0.0  # the last JPEG, its time [s]
         self._moves: deque[tuple[int, float, float]] = deque(maxlen=100)  # of the camera, for the next picture
         self._studio: list[tuple[Any, str]] = []  # Studio's sockets /ui with their sessions
-        self._watching: dict[
-            Any, float
-        ] = {}  # sockets that asked for pictures, in this order: time of the last request
+        self._watching: dict[Any, float] = {}  # sockets that asked for pictures -> time of the last request [s]
 
     def around(self, studio: Handler) -> Handler:
         """Studio's handler of WebSockets, with `/stream` beside it. While a page of ours drives, no page of Studio's does."""
@@ -104,11 +102,9 @@ class Stream:
                     continue
                 if sender is None and len(self._watching) >= WATCHERS:
                     await socket.close(FULL, f"{WATCHERS} browsers watch already")
-                elif sender is None:
-                    self._watching[socket] = time.monotonic()
-                    sender = asyncio.create_task(self._send(socket, asked))
-                if sender is not None:
-                    self._watching[socket] = time.monotonic()
+                    continue
+                sender = sender or asyncio.create_task(self._send(socket, asked))
+                self._watching[socket] = time.monotonic()
                 asked.release()
         finally:
             if sender is not None:
