@@ -1,8 +1,8 @@
-"""The first walk of a robot: six steps, each of whose values is compared with a simulated robot.
+"""The first walk of a robot: six steps, whose measured values are compared with those of a simulated robot.
 
 The steps are hanging, joint check, stand, emergency stop, ten steps on the spot, a metre ahead. A person presses a
 button before each step. The exam's robot is simulated from the export. It does the six steps first, and its values
-are the expected ones. If a value differs by more than is allowed, the joints are damped and the walk ends.
+are the expected values. If a difference is larger than allowed, the joints are damped and the walk ends.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ HANGING, JOINTS, STANDING, STOPPING, SPOT, METRE = STEPS = (
     "on the spot",
     "a metre",
 )
-STOP = "the emergency stop"  # what a person presses, beside START and WALK
-CALM, LOOK = 2.0, 1.0  # [s] ours: time to come to rest; time over which a value is averaged
-TURN, AHEAD = 0.5, 0.5  # [rad/s], [m/s] ours: commands, or the largest trained ones
+STOP = "the emergency stop"  # a button, like START and WALK
+CALM, LOOK = 2.0, 1.0  # [s] ours: settling time; averaging time
+TURN, AHEAD = 0.5, 0.5  # [rad/s], [m/s] ours: commands, clipped to the trained ranges
 COUNT = 10  # steps of each foot, on average
-PATIENCE, LONGEST = 2.0, 15.0  # ours: longest walk, in times of the exam's robot; its own longest walk [s]
-# Allowed differences, ours: a simulated robot with a delay of 10 ms, noise and 0.9 of its gains stays within them
+PATIENCE, LONGEST = 2.0, 15.0  # ours: time limit / time of the exam's robot; time limit [s] of the exam's robot
+# Allowed differences, ours: a simulated robot with 10 ms delay, noise and gains x 0.9 stays within them
 # (docs/first_walk.md)
-TILT, BEYOND, MOVED, LEFT = 15.0, 0.25, 0.05, 1.5  # [deg], [rad], [rad], [N m] of a robot that is damped
-ASIDE, HEADING, YAW, TIME = 0.25, 20.0, 0.1, 0.3  # [m], [deg], [rad/s], [s]
-CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; of its yaw rate, times and torques
-STANDS, WALKS = 0.1, 0.07  # [share of the motor's torque] of a torque in the stand; while the policy runs
-SHORT = 1.0  # [N m] a motor may give this much less than it is asked for, or SHARE of the torque
+TILT, BEYOND, MOVED, LEFT = 15.0, 0.25, 0.05, 1.5  # [deg]; [rad]; [rad]; [N m] while damped
+ASIDE, HEADING, YAW, TIME = 0.25, 20.0, 0.1, 0.3  # [m]; [deg]; [rad/s]; [s]
+CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; share of its yaw rate, times and torques
+STANDS, WALKS = 0.1, 0.07  # share of the motor's largest torque: in the stand; while the policy runs
+SHORT = 1.0  # [N m] the torque may be less than requested by this, or by SHARE of it
 
 
 class Value(NamedTuple):
-    """A value of one step. If each joint has one, it is that of the joint which differs most."""
+    """A measured value of one step. Of a value per joint, only the joint with the largest difference is kept."""
 
     step: str
     name: str
@@ -73,15 +73,15 @@ HEADS = f"{'':<73}{'robot':>8}{'exam':>8}"
 
 
 class Differs(Exception):
-    """A value differs from the exam's, in words."""
+    """A value differs from the exam's value. The message says which."""
 
 
 @dataclass
 class _Walked:
-    """What was measured since a command began, one entry a period."""
+    """Measurements since the command changed, one entry per control period."""
 
     torque: list[Floats]  # (D,) [N m]
-    asked: list[Floats]  # (D,) [N m] by the servos' stiffness
+    asked: list[Floats]  # (D,) [N m] requested: stiffness x position error
     tilt: list[float]  # [rad]
     turn: list[float]  # [rad/s] about the body's z axis
     velocity: list[Floats]  # (2,) [m/s] by leg odometry, body frame
@@ -89,19 +89,19 @@ class _Walked:
 
     @property
     def steps(self) -> float:
-        """Touchdowns of a foot, on average."""
+        """Mean number of touchdowns per foot."""
         down = np.array(self.stands)
         return float((down[1:] & ~down[:-1]).sum() / down.shape[1])
 
     def path(self, period: float) -> Floats:
-        """(2,) [m] ahead and to the left of where it began."""
+        """(2,) [m] position ahead and to the left, relative to the first pose."""
         heading, (x, y) = np.cumsum(self.turn) * period, np.array(self.velocity).T
         cos, sin = np.cos(heading), np.sin(heading)
         return period * np.array([(cos * x - sin * y).sum(), (sin * x + cos * y).sum()])
 
 
 class FirstWalk(JointCheck):
-    """The first walk of one robot. ``values``: all compared values. ``found``: all measured ones, an array by step and name."""
+    """The first walk of one robot. ``values``: the compared values. ``found``: (step, name) -> measured values."""
 
     def __init__(
         self,
@@ -112,9 +112,9 @@ class FirstWalk(JointCheck):
         limits: Limits,
         exam: Mapping[tuple[str, str], Floats] | None = None,
     ) -> None:
-        """``exam``: ``found`` of the exam's robot, from ``rehearse``; None: this is the exam's robot.
+        """``exam``: ``found`` of the exam's robot, from ``rehearse``; None: ``robot`` is the exam's robot.
 
-        Raises UserError if the policy has no velocity commands, RobotError as JointCheck does, ContractError without feet.
+        Raises UserError if the policy has no velocity commands, RobotError as JointCheck, ContractError without feet.
         """
         super().__init__(controller, sources, say, robot, limits)
         contract = controller.contract
@@ -122,7 +122,7 @@ class FirstWalk(JointCheck):
             raise UserError(f"--first_walk is of a policy that follows {', '.join(VELOCITY)}; {contract.task} does not")
         self._robot, self._exam, self._odometry = robot, exam, Odometry(controller.folder, contract, 1, "torque")
         self.values, self.found = list[Value](), dict[tuple[str, str], Floats]()
-        self.at, self.wants, self.ended = HANGING, "", ""  # step; what a person presses next; why the list ended
+        self.at, self.wants, self.ended = HANGING, "", ""  # step; next button; why the walk ended
         self._asked, self._now, self._steps = self._velocity(), 0.0, self._all()
         self._walked, self._judged = _Walked([], [], [], [], [], []), 0
         next(self._steps)
@@ -138,7 +138,7 @@ class FirstWalk(JointCheck):
 
     def listen(self, health: Health, now: float) -> Trip | None:
         stop = super().listen(health, now)
-        self.command = self._asked  # the sticks do not drive
+        self.command = self._asked  # the joysticks have no effect
         return stop
 
     def step(self, measured: Measurement, now: float) -> Order:
@@ -169,7 +169,7 @@ class FirstWalk(JointCheck):
         if self.state != POLICY:
             raise Differs(f"{self.at}: {self.note}")
 
-    # ---- the steps: generators that are sent measurements and yield orders
+    # ---- the steps: generators that receive measurements and yield orders
 
     def _all(self) -> Moves:
         measured = yield Order(ZERO)
@@ -183,7 +183,7 @@ class FirstWalk(JointCheck):
         yield from self._a_metre(measured)
 
     def _hangs(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """The robot hangs at zero torque, nearly level, and each joint angle is within its range."""
+        """The robot hangs at zero torque. Compare its tilt, and the distance of joint angles to their range."""
         while self._now < CALM:
             measured = yield Order(ZERO)
         self._want(START, f"{START}: joint check, if it hangs with its feet in the air")
@@ -197,7 +197,7 @@ class FirstWalk(JointCheck):
         return measured
 
     def _joints(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """The joint check. A verdict of its own also ends the walk."""
+        """Run the joint check. Its verdict can also end the walk."""
         self.at = JOINTS
         self._want("", f"each joint moves a little; {END} if another one moves than the one that is named", CHECK)
         yield from self._check(measured)
@@ -212,12 +212,12 @@ class FirstWalk(JointCheck):
         return (yield Order(DAMPING))
 
     def _get_up(self, measured: Measurement, how: str) -> Generator[Order, Measurement, Measurement]:
-        """From damping over zero torque to standing, at rest."""
+        """Go from damping to zero torque, then to the stand, and wait until the robot is at rest."""
         self._want(START, f"{how}; then {START}: zero torque", DAMPING)
         while self.state == DAMPING:
             measured = yield Order(DAMPING)
         if isinstance(self._robot, MujocoRobot):
-            self._robot.lower()  # a real one is lowered by a person
+            self._robot.lower()  # a person lowers a real robot
         self.wants = ""
         while self.state == ZERO:
             if self._now - self.since > CALM and not self.wants:
@@ -229,7 +229,7 @@ class FirstWalk(JointCheck):
         return measured
 
     def _stands(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """Compare the weight that the leg torques carry, and the torque of each motor."""
+        """Compare the weight on the legs, computed from their torques, and the torque of each motor."""
         carried, torques, asked = [], [], []
         for _ in range(self._periods(LOOK)):
             order = self._stand(measured, self._now)
@@ -238,14 +238,14 @@ class FirstWalk(JointCheck):
             torques.append(measured.joint_torque.copy())
             asked.append(order.stiffness * (order.targets - measured.joint_pos))
             measured = yield order
-        if len(self.controller.contract.feet) > 2:  # a biped stands on its rope until the policy starts
+        if len(self.controller.contract.feet) > 2:  # the rope holds a biped until the policy starts
             self._compare("weight on the legs", "kg", np.mean(carried), 0.0, CARRIED)
             self._compare_torque("torque", torques, asked, STANDS)
         self._judge()
         return measured
 
     def _stops(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """The person who will hold the emergency stop presses it: no torque may remain."""
+        """The operator presses the emergency stop. Compare the remaining torque."""
         self.at = STOPPING
         self._want(STOP, f"now press {STOP}")
         while self.state == STAND:
@@ -259,7 +259,7 @@ class FirstWalk(JointCheck):
         return measured
 
     def _on_the_spot(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """The policy stands, then turns slowly until it has done ten steps."""
+        """The policy stands, then turns slowly for ten steps of each foot."""
         self._want(WALK, f"{WALK}: policy, ten steps on the spot")
         while self.state == STAND:
             measured = yield self._stand(measured, self._now)
@@ -279,7 +279,7 @@ class FirstWalk(JointCheck):
         return (yield from self._rest(measured))
 
     def _a_metre(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """A metre ahead, by leg odometry."""
+        """Walk a metre ahead, measured by leg odometry."""
         self.at = METRE
         self._want(WALK, f"{WALK}: a metre ahead, with the rope slack")
         while WALK not in self._pressed:
@@ -294,18 +294,18 @@ class FirstWalk(JointCheck):
         self._compare_walk(done)
         return measured
 
-    # ---- their parts
+    # ---- parts of the steps
 
     @property
     def _lasted(self) -> float:
-        """[s] since the command began."""
+        """[s] since the command changed."""
         return len(self._walked.tilt) * self.controller.contract.period
 
     def _periods(self, seconds: float) -> int:
         return round(seconds / self.controller.contract.period)
 
     def _velocity(self, **wanted: float) -> Floats:
-        """Command (C,): the defaults and ``wanted``, within what was trained."""
+        """Command (C,): the defaults and ``wanted``, clipped to the trained ranges."""
         contract = self.controller.contract
         return contract.held(
             [wanted.get(each.name, 0.0 if each.name in VELOCITY else each.default) for each in contract.commands]
@@ -314,7 +314,10 @@ class FirstWalk(JointCheck):
     def _walk(
         self, measured: Measurement, command: Floats, done: Callable[[], bool], timed: str = ""
     ) -> Generator[Order, Measurement, Measurement]:
-        """Let the policy follow ``command`` until it is ``done``. ``timed``: the name of its duration as a value."""
+        """Run the policy with ``command`` until ``done`` returns true. ``timed``: the name of the duration as a value.
+
+        Raises Differs if the time limit is reached.
+        """
         self._asked, self._walked = command, _Walked([], [], [], [], [], [])
         exam = None if self._exam is None or not timed else self._exam[self.at, timed]
         longest = LONGEST if exam is None else PATIENCE * float(exam[0])
@@ -325,12 +328,12 @@ class FirstWalk(JointCheck):
         return measured
 
     def _rest(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """A period of the policy with the command to stand."""
+        """Run the policy for one control period with the command zero."""
         self._asked = self._velocity()
         return (yield from self._act(measured))
 
     def _act(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
-        """A period of the policy."""
+        """Run the policy for one control period and record the measurements."""
         walked, estimate = self._walked, self._odometry(measured)
         walked.torque.append(measured.joint_torque.copy())
         walked.tilt.append(_tilt(measured))
@@ -344,14 +347,14 @@ class FirstWalk(JointCheck):
         return (yield Order(POLICY, targets))
 
     def _want(self, button: str, note: str, state: str = "") -> None:
-        """Say what a person presses next; enter ``state`` if there is one."""
+        """Set the next button and print ``note``. Enter ``state`` if given."""
         self.wants = button
         if state and state != self.state:
             self._enter(state, self._now, note)
         else:
             self._tell(note)
 
-    # ---- what is measured, beside the exam's
+    # ---- comparison with the exam's robot
 
     def _compare_walk(self, timed: str) -> None:
         self._compare(timed, "s", self._lasted, TIME, SHARE)
@@ -367,13 +370,13 @@ class FirstWalk(JointCheck):
 
     @property
     def _motor_torque(self) -> Floats:
-        """(D,) [N m] largest torque of the motors; 20 where none is known."""
+        """(D,) [N m] largest torque of the motors; 20 if unknown."""
         return np.where(np.isfinite(self._limits.motor), self._limits.motor, 20.0)
 
     def _compare_torque(self, name: str, torques: Sequence[Floats], asked: Sequence[Floats], share: float) -> None:
-        """Compare mean torques (N, D) with the exam's, and with the torques asked of the servos: a weak motor gives less.
+        """Compare mean torques (N, D) with the exam's, and with the requested torques: a weak motor gives less.
 
-        A motor that reports the asked torque instead differs from the exam's torque, or from the carried weight.
+        If a motor reports its requested torque instead, the torque or the weight on the legs differs from the exam's.
         """
         torque = np.mean(torques, axis=0)
         short = np.abs(np.mean(asked, axis=0) - torque)
@@ -381,7 +384,7 @@ class FirstWalk(JointCheck):
         self._compare(name, "N m", torque, share * self._motor_torque, SHARE)
 
     def _compare(self, name: str, unit: str, measured: Any, least: float | Floats, share: float = 0.0) -> None:
-        """Keep a value, or one per joint (D,). Allowed: the larger of ``least`` and ``share`` of the exam's value."""
+        """Store a value, or one per joint (D,). Allowed difference: ``least`` or ``share`` of the exam's, the larger."""
         measured = np.atleast_1d(measured)
         self.found[self.at, name] = measured
         exam = measured if self._exam is None else self._exam[self.at, name]
@@ -393,7 +396,7 @@ class FirstWalk(JointCheck):
         )
 
     def _judge(self) -> None:
-        """Print the values since the last call. Raises Differs if one is not right."""
+        """Print the values since the last call. Raises Differs if one differs by more than allowed."""
         new, self._judged = self.values[self._judged :], len(self.values)
         if new:
             self._say("\n".join([HEADS, *map(str, new)]))
@@ -402,14 +405,14 @@ class FirstWalk(JointCheck):
 
     @property
     def report(self) -> str:
-        """The outcome in a line, after a newline."""
+        """A newline and the result in one line."""
         if self.right:
             return f"\nfirst walk: all {len(STEPS)} steps done, {len(self.values)} values as the exam's"
         return f"\nfirst walk: it ended at '{self.at}': {self.ended or self.note}"
 
 
 def _tilt(measured: Measurement) -> float:
-    """[rad] between gravity and the body's z axis."""
+    """[rad] angle between gravity and the body's negative z axis."""
     return math.acos(float(np.clip(-measured.gravity[2], -1.0, 1.0)))
 
 
@@ -417,7 +420,7 @@ def _tilt(measured: Measurement) -> float:
 
 
 class _Willing:
-    """An input source that presses the wanted button."""
+    """An input source that presses the next button at once."""
 
     def __init__(self) -> None:
         self.walk: FirstWalk | None = None
@@ -434,7 +437,7 @@ class _Willing:
 def first_walk(
     robot: Robot, folder: Path, contract: Contract, exam: Mapping[tuple[str, str], Floats] | None = None
 ) -> FirstWalk:
-    """The first walk of a simulated ``robot`` that hangs. Every wanted button is pressed at once."""
+    """The first walk of a simulated ``robot`` that starts hanging. Each button is pressed at once."""
     controller, willing = Controller(folder, contract), _Willing()
     limits = Limits.of(folder, contract, robot.limits)
     walk = willing.walk = FirstWalk(controller, [willing], lambda _: None, robot, limits, exam)
@@ -443,7 +446,7 @@ def first_walk(
 
 
 def rehearse(folder: Path, contract: Contract) -> Mapping[tuple[str, str], Floats]:
-    """The values of the exam's robot. Raises UserError if it does not complete all steps."""
+    """The measured values of the exam's robot. Raises UserError if it does not complete all steps."""
     walk = first_walk(MujocoRobot(folder, contract, whole=True, hoisted=True, lift=LIFT), folder, contract)
     if not walk.right:
         raise UserError(f"the exam's robot itself does not do it:{walk.report.replace(chr(10), ' ')}; see --eval first")

@@ -1,4 +1,4 @@
-"""legged-mw exam POLICY ...: grade policies over several seeds, and compare with an earlier result of the same exam.
+"""legged-mw exam POLICY ...: grade policies with several seeds and compare with an earlier result of the same exam.
 
 It runs exports in MuJoCo's C engine, without torch and without a GPU. Exit code 1: a mark fell.
 """
@@ -28,15 +28,15 @@ from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import typed, writable
 from legged_mw.utils.machine import usable_cores
 
-VERSION = 1  # of the exams: raise it when the meaning of a figure changes; only equal versions are compared
+VERSION = 1  # of the exams. Raise it when the meaning of a figure changes; only equal versions are compared
 SEEDS = 3
-# A mark falls when its mean is worse than the stored mean by more than the tolerance. The tolerance is the largest of:
-# SPREAD times the range of the stored repeats, the range of the new repeats, SHARE of the stored mean, LEAST of the mark.
-# go2_flat and g1_flat, compared with themselves 110 times with three repeats a side, gave 3 and 1 false alarms.
+# A mark falls if the new mean is worse than the stored mean by more than the tolerance. The tolerance is the largest of:
+# SPREAD x range of the stored repeats, range of the new repeats, SHARE x stored mean, LEAST x pass mark.
+# 110 comparisons of a policy with itself, three repeats a side, gave 3 false alarms for go2_flat and 1 for g1_flat.
 SPREAD, SHARE, LEAST = 2.0, 0.1, 0.02
 FELL = 1  # exit code
 
-Export = Callable[[str, int, Path], None]  # a run's name, a checkpoint's iteration or -1, a folder to export to
+Export = Callable[[str, int, Path], None]  # run's name, checkpoint's iteration or -1, folder of the new export
 
 
 def parse() -> argparse.Namespace:
@@ -65,7 +65,7 @@ def parse() -> argparse.Namespace:
 
 
 def main(export: Export) -> None:
-    """The program. ``export`` makes an export of a run that has none, which needs torch."""
+    """Run the program. ``export`` exports a run that has no export; it needs torch."""
     args = parse()
     before = read_result(typed(args.against)) if args.against else None
     with TemporaryDirectory() as place:
@@ -95,7 +95,7 @@ def main(export: Export) -> None:
 
 
 def find_export(name: str, checkpoint: int = -1) -> Path | None:
-    """The folder of the export ``name``: an export, a run's own, or one that ships. None: the run has no export yet."""
+    """The export folder of ``name``: an export, a run or a shipped policy. None: the run has no export yet."""
     folder = typed(name)
     if checkpoint == -1:
         for path in (folder, folder / "export"):
@@ -107,7 +107,7 @@ def find_export(name: str, checkpoint: int = -1) -> Path | None:
 def _shipped(name: str) -> Path | None:
     try:
         return find(name)
-    except UserError:  # perhaps a run: the caller says what there is
+    except UserError:  # it may be a run, which the caller exports
         return None
 
 
@@ -116,11 +116,11 @@ def _exported(export: Export, name: str, checkpoint: int, folder: Path) -> Path:
     return folder
 
 
-# ---- what is asked ----------------------------------------------------------------------------------------------------
+# ---- exam and robot ---------------------------------------------------------------------------------------------------
 
 
 def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """The exam and the robot of a result. Two results are compared only if all of it is equal."""
+    """The exam and the robot of a result. Two results can be compared only if both are equal."""
     contract = read_contract(folder, args.edited)
     section = dict(contract.exam or {})
     if "kind" in section:
@@ -132,11 +132,11 @@ def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         exam = {"kind": "walking", "hard": bool(contract.feet) and not args.no_hard, "rules": rules.to_mapping()}
         exam |= {"scene": typed(args.scene).name} if args.scene else {}
     said = {"exam": {**exam, "version": VERSION}, "robot": {"joints": list(contract.joints)}}
-    return json.loads(json.dumps(said))  # as a file has it: lists, no tuples
+    return json.loads(json.dumps(said))  # tuples become lists, as in a result file
 
 
 def check_alike(asked: Mapping[str, Any], other: Mapping[str, Any], name: str, against: str) -> None:
-    """Raise UserError if two results differ in their exam or their robot."""
+    """Raise UserError if the exam or the robot of two results differ."""
     for place in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "scene", "hard", "rules"))):
         mine, theirs = (said[place[0]].get(place[1]) for said in (asked, other))
         if mine != theirs:
@@ -156,10 +156,10 @@ def _short(value: Any) -> str:
 
 
 class Repeat(NamedTuple):
-    """One repeat of the exam."""
+    """The result of one repeat of the exam."""
 
     verdicts: dict[str, bool]
-    figures: list[Figure]  # those with a mark
+    figures: list[Figure]  # figures with a mark
 
 
 def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
@@ -188,7 +188,7 @@ def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Na
 
 
 def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Namespace) -> Repeat:
-    """Grade an export once, with one seed."""
+    """Grade an export with one seed."""
     if exam["kind"] != "walking":
         skill = contract_skill(read_contract(folder, args.edited))
         result = run_skill(folder, skill, edited=args.edited, seed=seed)
@@ -208,7 +208,7 @@ def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Names
 
 
 def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
-    """The marks of the hard exam's conditions."""
+    """The figures with a mark of the hard exam's conditions."""
     falls = sum(each["falls"] for each in result["conditions"].values())
     return [
         Figure("falls in commands under conditions", falls, 0, 0),
@@ -218,7 +218,7 @@ def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
 
 
 def named(figures: Sequence[Figure]) -> list[Figure]:
-    """The figures with a mark. An indented row also gets the name of the row above, so that names are unique."""
+    """The figures with a mark. The name of the row above is added to an indented row, so that names are unique."""
     found, above = [], ""
     for figure in figures:
         above = above if figure.name.startswith(" ") else figure.name
@@ -228,7 +228,7 @@ def named(figures: Sequence[Figure]) -> list[Figure]:
 
 
 def marks_of(repeats: Sequence[Sequence[Figure]]) -> list[dict[str, Any]]:
-    """Each mark with its values in all repeats, their mean, the worst of them, and its tolerance."""
+    """Each mark with its values in all repeats, their mean, their worst value and the tolerance."""
     marks = []
     for name, figure in {figure.name: figure for each in repeats for figure in each}.items():
         values = [each.value for figures in repeats for each in figures if each.name == name]
@@ -253,7 +253,7 @@ def marks_of(repeats: Sequence[Sequence[Figure]]) -> list[dict[str, Any]]:
 
 
 def commit() -> str:
-    """The commit of the repository in the current folder, with -dirty if files were changed; "" without git."""
+    """The commit of the repository in the current folder, with -dirty if files are changed; "" without git."""
     try:
         asked = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
         return subprocess.run(asked, capture_output=True, text=True, timeout=10).stdout.strip()
@@ -262,7 +262,7 @@ def commit() -> str:
 
 
 def machine() -> str:
-    """System, processor and the cores that this process may use."""
+    """System, processor, and number of cores that this process may use."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -274,15 +274,15 @@ def machine() -> str:
 def _version(package: str) -> str:
     try:
         return version(package)
-    except PackageNotFoundError:  # on the path but not installed
+    except PackageNotFoundError:  # imported from a folder, not installed
         return ""
 
 
-# ---- comparing --------------------------------------------------------------------------------------------------------
+# ---- comparison -------------------------------------------------------------------------------------------------------
 
 
 def read_result(file: Path) -> dict[str, Any]:
-    """Read a result that ``--json`` wrote. Raises UserError if the file is another one or incomplete."""
+    """Read a result that ``--json`` wrote. Raises UserError if the file is not such a result or is incomplete."""
     advice = "name a file that legged-mw exam POLICY --json FILE wrote"
     try:
         result = json.loads(file.read_text(encoding="utf-8"))
@@ -303,7 +303,7 @@ def read_result(file: Path) -> dict[str, Any]:
 
 
 def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
-    """A line for each mark that is worse than ``before`` by more than its tolerance."""
+    """One line for each mark that is worse than in ``before`` by more than its tolerance."""
     now, lines = {each["name"]: each for each in result["marks"]}, []
     for was in before["marks"]:
         new, digits = now.get(was["name"], {"mean": None}), was["digits"]
@@ -321,7 +321,7 @@ def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
 
 
 def table(result: Mapping[str, Any], before: Mapping[str, Any] | None) -> str:
-    """The marks as text, with those of ``before`` in a column of their own."""
+    """The marks as a text table. The marks of ``before`` have their own column."""
     heads = ["mean", "worst", "mark", "passes", *(["was", "tolerance"] if before else ["tolerance"])]
     old = {each["name"]: each for each in before["marks"]} if before else {}
     lines = [
@@ -350,7 +350,7 @@ LETTER, PAD, HEIGHT = 7.0, 8.0, 20  # [px]
 
 
 def badge(result: Mapping[str, Any]) -> str:
-    """An SVG with the task and the last verdict that is true in all repeats."""
+    """An SVG with the task's name and the last verdict that is true in all repeats."""
     held = [word for word, repeats in result["verdicts"].items() if all(repeats)]
     word = (
         held[-1] if held else {"walks": "does not walk"}.get(first := next(iter(result["verdicts"])), f"not: {first}")

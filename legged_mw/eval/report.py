@@ -1,4 +1,4 @@
-"""Write the report from results and figures: one self-contained HTML page, JSON, pictures."""
+"""Write the report of an exam: a self-contained HTML page, JSON and pictures."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ STROKE = "The stroke on each scale is what the exam allows on average. "
 
 
 class Column(NamedTuple):
-    """One policy in one physics engine: a column of the tables."""
+    """The result of one policy in one physics engine: a column of the tables."""
 
     name: str
-    about: dict[str, Any]  # policy, engine, device, overrides; a warning if contact buffers overflowed
+    about: dict[str, Any]  # policy, engine, device, overrides; a warning if the contact buffers overflowed
     exam: dict[str, Any]  # the result of ``ExamRules.grade``
-    figures: dict[str, Any] | None = None  # None: exam result only, such as on another physics engine
-    strip: bytes = b""  # a PNG of one stride; empty: none
+    figures: dict[str, Any] | None = None  # None: only the exam's result, as on another physics engine
+    strip: bytes = b""  # PNG of one stride, or empty
 
     def plain(self) -> dict[str, Any]:
-        """All but the picture, for JSON."""
+        """All fields except the picture, for JSON."""
         return {name: value for name, value in self._asdict().items() if name != "strip"}
 
 
 def walking_page(
     task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]
 ) -> str:
-    """The whole page. ``rules``: those of the first column."""
+    """The HTML page of the walking exam. ``rules``: the rules of the first column."""
     words: dict[str, Any] = {
         "speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)),
         "vx": rules.push_vx,
@@ -95,7 +95,7 @@ def walking_page(
 
 
 def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]) -> str:
-    """The whole HTML document. ``body`` begins inside the header, below the task's name, and must close the header."""
+    """The HTML document. ``body`` starts inside the header element, below the task's name, and must close it."""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: {escape(exam)}</title><style>{CSS}</style></head>
@@ -107,7 +107,7 @@ def _page(task: str, exam: str, above: str, body: str, columns: Sequence[Column]
 
 
 def _hard(column: Column) -> str:
-    """The chapter of the hard exam: conditions, how it looks, a stride in pictures."""
+    """The section of the hard exam: results by condition, gait figures, pictures of one stride."""
     result = column.exam["hard"]
     heads, *rows = hard.condition_rows(result)
     looked = (
@@ -121,7 +121,7 @@ def _hard(column: Column) -> str:
 
 
 def _heats(columns: Sequence[Column]) -> str:
-    """The chapter of heat and power for each column: the verdict, a line per finding, a row per motor."""
+    """The section of heat and power for each column: the verdict, one line per result, one row per motor."""
     chapters = []
     for result in (column.exam["heat"] for column in columns if "heat" in column.exam):
         *said, _ = (f"<li>{escape(line)}</li>" for line in heat.lines(result))
@@ -134,7 +134,7 @@ def _heats(columns: Sequence[Column]) -> str:
 
 
 def _names(columns: Sequence[Column], rules: ExamRules) -> str:
-    """The list of graded policies with their verdicts, in the colours of their curves."""
+    """The list of policies with their verdicts and the colours of their curves."""
     items, drawn = [], [column.name for column in columns if column.figures]
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
@@ -147,7 +147,7 @@ def _names(columns: Sequence[Column], rules: ExamRules) -> str:
 
 
 def _said(words: str) -> tuple[str, str]:
-    """The words for true and for false of a verdict such as ``walks``."""
+    """The texts of a verdict such as ``walks``, if true and if false."""
     verb, _, rest = words.partition(" ")
     return words, f"does not {verb.removesuffix('s')} {rest}".strip()
 
@@ -182,7 +182,7 @@ def _mood(figure: Figure) -> str:
 def exam_table(
     columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str, asks: str = "walks at"
 ) -> str:
-    """A table with one row per figure. Later columns also show the gap to the first column."""
+    """A table with one row per figure. Each column after the first also shows its difference to the first."""
     lines = []
     for first, *others in zip(*figures, strict=True):
         cells = [f'<td><span class="value{_mood(first)}">{first.text(first.value)}</span></td>']
@@ -205,7 +205,7 @@ def exam_table(
 
 
 def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
-    """A table with one row per policy: the graded policies, then the published ones."""
+    """A table with one row per policy: the graded policies, then the published policies."""
     peers = [(peer.name, peer.figures, f"{peer.asked['push_vx']:g}") for peer in rules.peers]
     rows = [(column.name, column.exam, f"{rules.push_vx:g}") for column in columns]
     heads = [
@@ -242,7 +242,7 @@ def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
 
 
 def _extra(name: str, columns: Sequence[Column]) -> str:
-    """The table below a section's plots; two policies alternate row by row."""
+    """The table below a section's plots. The rows of two policies alternate."""
     drawn = [column for column in columns if column.figures]
     figures: dict[str, Any] = drawn[0].figures or {}
     tables = {
@@ -258,7 +258,7 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
     if name not in tables:
         return ""
     make, heads, folded = tables[name]
-    # zip_longest, because the policies' command ranges may differ
+    # zip_longest: the policies' command ranges may differ
     paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))
     return table(heads, [row for rows in paired for row in rows if row], folded)
 
@@ -302,7 +302,7 @@ def _joint_rows(column: Column, whose: str) -> list[list[str]]:
 
 
 def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
-    """A table. With a title ``folded`` it starts folded below that title."""
+    """An HTML table. If ``folded`` is a title, the table is collapsed below it."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
         f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows
@@ -312,7 +312,7 @@ def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
 
 
 def about(columns: Sequence[Column]) -> str:
-    """The policies, their physics engines and devices, and the overrides."""
+    """The policies with their physics engines, devices and overrides, as HTML."""
     parts = []
     for column in columns:
         about: dict[str, Any] = column.about
@@ -335,7 +335,7 @@ def about(columns: Sequence[Column]) -> str:
 
 
 def skill_page(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str, bytes]) -> str:
-    """The whole page. ``strips``: part -> PNG of a robot that failed, else of the slowest robot."""
+    """The HTML page of a skill exam. ``strips``: part -> PNG of a robot that failed, else of the slowest robot."""
     passed = [f"<li><b>{escape(c.name)}</b> {pill('passes', 'does not pass', c.exam['passed'])}</li>" for c in columns]
     sections = []
     for part in skill.grounds:
@@ -347,7 +347,7 @@ def skill_page(task: str, skill: Skill, columns: Sequence[Column], strips: Mappi
 
 
 def picture(png: bytes, name: str) -> str:
-    """The HTML of one picture strip."""
+    """One picture strip as HTML."""
     return f'<p><img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt="{escape(name)}" style="max-width:100%"></p>'
 
 
@@ -357,9 +357,9 @@ def picture(png: bytes, name: str) -> str:
 def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     """Write ``report.json`` and the self-contained ``report.html``.
 
-    Every column is compared with the first, by the rules of the first. At most two columns have figures.
+    All columns are compared with the first column, by its rules. At most two columns have figures.
     """
-    from legged_mw.eval import plots  # matplotlib takes a second to import
+    from legged_mw.eval import plots  # imports matplotlib, which takes a second
 
     folder.mkdir(parents=True, exist_ok=True)
     asked = ExamRules.from_mapping(columns[0].exam["rules"])

@@ -1,7 +1,7 @@
-"""The walking exam in the training environment: roll out a policy, one case per world, and record signals.
+"""Run the walking exam in the training environment and record signals.
 
-A case is a sequence of commands and an optional push. All cases run in parallel, once. The exam, the report and the
-exam during training differ only in their cases and signals.
+A case is a sequence of commands and an optional push. Each case runs once, in its own world. The exam, the report and
+the exam during training differ only in their cases and signals.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Signal = Callable[[Any], Tensor]  # environment -> one value per world, (N, ...)
 
 
 class Push(NamedTuple):
-    """A jump of the base's horizontal velocity, between the action and the physics of control step ``step``."""
+    """An instant change of the base's horizontal velocity, after the policy acts in control step ``step``."""
 
     step: int  # [control steps]
     speed: float  # [m/s]
@@ -46,7 +46,7 @@ class Push(NamedTuple):
 class Case(NamedTuple):
     """The commands and the push of one world."""
 
-    # (first control step, values of the first commands of the task's table); further commands keep their defaults
+    # (first control step, values of the first commands in the task's table); other commands keep their defaults
     commands: tuple[tuple[int, tuple[float, ...]], ...]
     push: Push | None = None
 
@@ -66,14 +66,14 @@ def roll_out(
 ) -> Record:
     """Run each case in its own world for ``steps`` control steps.
 
-    The actions of the first ``alone`` worlds do not depend on the number of further worlds.
+    The first ``alone`` worlds are a separate batch, so their actions do not depend on the other worlds.
     """
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
     timeline = _timeline(cases, steps, [command.default for command in env.command_table])
     asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
-    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer; write to a spare one
+    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer
     commands.copy_(asked[0])
     obs, actor = env.first_observations(), _Actor(policy, env.num_envs, alone)
     fell_at, kept = torch.full((env.num_envs,), math.inf, device=env.device), dict[str, Tensor]()
@@ -87,7 +87,7 @@ def roll_out(
         if step in pushes:
             worlds, jumps = pushes[step]
             env.root_lin_vel[worlds, :2] += jumps
-        # set the next command before the step, because the observation at its end must already show it
+        # set the next command before the step, because the observation at the end of the step contains it
         if step + 1 < steps:
             commands.copy_(asked[step + 1])
         obs, _, dones, _ = env.step(actions)
@@ -124,7 +124,7 @@ class _Actor:
             return torch.cat([policy(obs[worlds]) for policy, worlds in self._parts])
 
     def believed(self, obs: TensorDict) -> dict[str, Tensor]:
-        """The signal "estimate" of a policy with a velocity estimator: vx, vy (N, 2) [m/s]. Else empty."""
+        """The signal "estimate" (N, 2): estimated vx, vy [m/s]. Empty if the policy has no velocity estimator."""
         with torch.inference_mode():
             found = [
                 value for policy, worlds in self._parts if (value := believed_velocity(policy, obs[worlds])) is not None
@@ -147,7 +147,7 @@ def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> ND
 
 
 def _pushes_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
-    """Control step -> pushed worlds (M,), and the jumps of their horizontal velocity (M, 2) [m/s, world frame]."""
+    """Control step -> pushed worlds (M,) and the changes of their velocity (M, 2) [m/s], horizontal, world frame."""
     pushed, found = [(world, case.push) for world, case in enumerate(cases) if case.push], {}
     for step in {push.step for _, push in pushed}:
         now = [(world, push) for world, push in pushed if push.step == step]
@@ -180,7 +180,7 @@ OVERRIDES: dict[str, Any] = {
     "termination.max_tilt": 90.0,  # [deg]; only a larger tilt is a fall
     "termination.min_base_height": 0.0,
 }
-# Config fields that the user may not override. Domain randomization is none of them: it lets a user grade other robots.
+# Config fields that a user may not override. A user may enable domain randomization, to grade other robots.
 SETS = {*OVERRIDES, "env.num_envs"} - {"domain_rand.enable"}
 
 SIGNALS: dict[str, Signal] = {
@@ -193,20 +193,20 @@ SIGNALS: dict[str, Signal] = {
 
 
 def prepare(task: LoadedTask, worlds: int | None = None) -> None:
-    """Turn ``task`` into the exam with ``worlds`` worlds; by default one per command and one per push."""
+    """Set the exam's overrides and number of worlds in ``task``. Default: one world per command and per push."""
     for path, value in OVERRIDES.items():
         task.set(path, value, where="exam")
     task.cfg.env.num_envs = worlds or ExamRules.from_config(task.cfg).worlds()
 
 
 def cases(rules: ExamRules, dt: float, push_at: float | None = None) -> list[Case]:
-    """The cases of the exam in the order of ``ExamRules.grade``. The first pushes come at ``push_at`` [s]."""
+    """The cases of the exam in the order of ``ExamRules.grade``. The first pushes are at ``push_at`` [s]."""
     at = PUSH_AT if push_at is None else push_at
     return [*map(holding, rules.held()), *pushes(rules, (rules.push_vx, 0.0, 0.0), round(at / dt))]
 
 
 def pushes(rules: ExamRules, command: Velocity, step: int) -> list[Case]:
-    """One push per case, at every speed and in every direction. Direction k comes at control step ``step`` + k."""
+    """One case per push speed and direction. The push in direction k is at control step ``step`` + k."""
     angles = [2 * math.pi * k / PUSH_DIRECTIONS for k in range(PUSH_DIRECTIONS)]
     return [
         holding(command, Push(step + k, speed, angle)) for speed in rules.push_speeds for k, angle in enumerate(angles)
@@ -226,14 +226,14 @@ def grade(rules: ExamRules, record: Record) -> dict[str, Any]:
     )
 
 
-# ---- the report's cases: those of the exam, then further ones. Commands stay in the trained ranges
+# ---- the report's cases: the exam's cases, then others. All commands are in the trained ranges
 
 
 GRID = (13, 9, 9)  # number of values of vx, vy, yaw rate
-STEP_SHARE = 2 / 3  # target of a step, as a share of the end of the range
+STEP_SHARE = 2 / 3  # command of a step response, as a share of the range's limit
 STEPS_AT = (2.5, 5.0, 7.5)  # [s]: reverse, stop, start again
-# [s] The first of 8 worlds starts to walk at STEP_BEGINS, each further one STEP_SHIFT later.
-# So a step of the command meets each world in another phase of its gait.
+# [s] The first of 8 worlds starts to walk at STEP_BEGINS, each next world STEP_SHIFT later.
+# So the command changes at a different gait phase in each world.
 STEP_BEGINS, STEP_REPEATS, STEP_SHIFT = 0.2, 8, 0.06
 NAMES = ("vx", "vy", "yaw")
 
@@ -259,7 +259,7 @@ def make_plan(cfg: LeggedRobotCfg, dt: float) -> Plan:
     exams, commands, held = cases(rules, dt), len(rules.commands()), len(rules.held())
     groups = {
         "commands": exams[:commands],
-        "transport": exams[commands:held],  # empty if the exam has this command among the 22
+        "transport": exams[commands:held],  # empty if the command is one of the 22
         "pushes": exams[held:],
         "vx_yaw": [holding((vx, rest[1], yaw)) for yaw in axes[2] for vx in axes[0]],
         "vx_vy": [holding((vx, vy, rest[2])) for vy in axes[1] for vx in axes[0]],
@@ -273,7 +273,7 @@ def make_plan(cfg: LeggedRobotCfg, dt: float) -> Plan:
 
 
 def _stepping(axis: int, limits: list[float], dt: float) -> list[Case]:
-    """Cases whose command steps along one axis: walk, reverse, stand, walk again. Each world starts a little later."""
+    """Cases of a step response on one axis: stand, walk, reverse, stand, walk. Each next world starts to walk later."""
     stand: Velocity = (0.0, 0.0, 0.0)
     low, high = ((*stand[:axis], round(STEP_SHARE * limit, 2), *stand[axis + 1 :]) for limit in limits)
     begins = [round((STEP_BEGINS + i * STEP_SHIFT) / dt) for i in range(STEP_REPEATS)]
@@ -284,8 +284,8 @@ def _stepping(axis: int, limits: list[float], dt: float) -> list[Case]:
 # ---- the report's figures
 
 
-GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # [s] of each command in the gait diagram and in the estimator's plot
-BEFORE_STEP = 0.5  # [s] before the step in the plot of a step response
+GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # [s] plotted of each command in the gait diagram and the estimator's plot
+BEFORE_STEP = 0.5  # [s] plotted before a step of the command
 
 REPORT_SIGNALS: dict[str, Signal] = {
     **SIGNALS,
@@ -293,24 +293,24 @@ REPORT_SIGNALS: dict[str, Signal] = {
     "dof_pos": lambda env: env.dof_pos,  # (N, D) [rad]
     "dof_vel": lambda env: env.dof_vel,  # (N, D) [rad/s]
     "torque": lambda env: env.torques,  # (N, D) [N m], one simulation step old
-    "motor_speed": lambda env: env.sim.actuator_velocity(),  # (N, D) [rad/s], of the same moment as the torque
+    "motor_speed": lambda env: env.sim.actuator_velocity(),  # (N, D) [rad/s], at the time of the torque
     "reward": lambda env: env.episode_sums,  # (N, K), sum of scale * term * dt since the start
 }
 
 
 def prepare_report(task: LoadedTask) -> None:
-    """Turn ``task`` into the exam with the extra worlds of the report."""
+    """Set the exam's overrides and the report's number of worlds in ``task``."""
     prepare(task)
     make_room(task)
 
 
 def make_room(task: LoadedTask) -> None:
-    """Set the number of worlds of the report. It depends on the command ranges."""
+    """Set the report's number of worlds. It depends on the command ranges."""
     task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
 
 
 def ask_alike(tasks: Sequence[LoadedTask]) -> None:
-    """Give all prepared tasks the exam rules of the first, whatever ranges they were trained in."""
+    """Set the exam rules of the first prepared task in the others, even if their trained ranges differ."""
     first, *others = (ExamRules.from_config(task.cfg) for task in tasks)
     for task, own in zip(tasks[1:], others, strict=True):
         if own != first:
@@ -319,7 +319,7 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
 
 
 def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The exam's result and the report's figures, from one roll-out in the environment of a prepared task."""
+    """The exam's result and the report's figures, from one rollout in the environment of a prepared task."""
     plan, asked = make_plan(env.cfg, env.dt), ExamRules.from_config(env.cfg)
     record = roll_out(env, policy, plan.cases, round(EXAM_SECONDS / env.dt), REPORT_SIGNALS, alone=asked.worlds())
     gathered = gather(env, asked, plan, record)
@@ -327,7 +327,7 @@ def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str,
 
 
 def gather(env: LeggedRobot, asked: ExamRules, plan: Plan, record: Record) -> dict[str, Any]:
-    """All figures of the report beside the exam's result, as plain numbers."""
+    """All figures of the report except the exam's result, as plain numbers."""
     parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
     settled, until = round(SETTLING / env.dt), round(PUSH_UNTIL / env.dt)
     held, axes, first = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
@@ -380,13 +380,13 @@ def motor_limits(env: LeggedRobot) -> figures.MotorLimits:
 
 
 TRAINING_SECONDS = 4.0  # [s] duration of the roll-out
-TRAINING_SETTLING = 2.0  # [s] at its start, without error measurement
-ERRORS = ("error_vx", "error_vy", "error_yaw")  # of the exam during training
+TRAINING_SETTLING = 2.0  # [s] settling time at its start, not measured
+ERRORS = ("error_vx", "error_vy", "error_yaw")
 TRAINING_PUSH_AT = 1.0  # [s] time of the first of 16 pushes; a push is survived if the robot stands at the end
 
 
 def copy_of(task: LoadedTask) -> LoadedTask:
-    """A copy of the task with its overrides, which may be turned into an exam."""
+    """A copy of the task with its overrides. Changes to the copy do not change ``task``."""
     copy = load_task(str(task.path))
     copy.update(task.to_dict(), where="training")
     copy.exam = task.exam
@@ -394,7 +394,7 @@ def copy_of(task: LoadedTask) -> LoadedTask:
 
 
 class TrainingExam:
-    """The 22 commands and the 16 pushes at ``push_mark``, 4 s each. A call with a policy returns figures by name.
+    """22 commands and 16 pushes at ``push_mark``, 4 s each. A call with a policy returns figures by name.
 
     The environment is made from a copy of the task, with the overrides of the training run. The random generators are
     restored after each exam, so training continues unchanged.
@@ -410,9 +410,9 @@ class TrainingExam:
             self.env = copy.env_class(copy.cfg, device, eager=eager)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
-        """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]; ``falls`` of 22; ``pushes_survived``, a share.
+        """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]; ``falls`` of 22; ``pushes_survived`` (0 to 1).
 
-        For a policy with a velocity estimator also its RMS errors ``estimate_vx``, ``estimate_vy`` [m/s].
+        A policy with a velocity estimator also has its RMS errors ``estimate_vx``, ``estimate_vy`` [m/s].
         """
         dt = self.env.dt
         with keep_random_state(self.env.device):
@@ -425,9 +425,9 @@ class TrainingExam:
 
 
 def training_figures(record: Record, count: int) -> dict[str, float]:
-    """The figures of a record. Its first ``count`` worlds have constant commands, the others are pushed.
+    """The figures of a record. The first ``count`` worlds have constant commands; the others are pushed.
 
-    A world that fell gets the error of standing still.
+    The error of a world that fell is its command, as if the robot stood still.
     """
     settled, stood = round(TRAINING_SETTLING / record.dt), np.isinf(record.fell_at)
     asked = record.commands[settled:, :count, :3]

@@ -1,7 +1,7 @@
-"""The walking exam: its commands, measures, pass marks and verdict. Needs numpy, but neither torch nor warp.
+"""The commands, measures, pass marks and verdicts of the walking exam. This module imports no torch and no warp.
 
-``rollout`` applies it in the training environment, ``legged_mw.deploy`` to an exported policy. A push is a jump of
-the base's velocity.
+``rollout`` runs the exam in the training environment, ``legged_mw.deploy`` runs it on an exported policy. A push sets
+the base's velocity at once.
 """
 
 from __future__ import annotations
@@ -22,23 +22,22 @@ from legged_mw.utils.commands import LABELS, VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-EXAM_SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command, and settling time at its start that is not measured
-# [s] time of the first push; [s] time at which the robot must still stand; number of directions
+EXAM_SECONDS, SETTLING = 10.0, 2.0  # [s] duration of a command; settling time at its start, not measured
+# [s] time of the first push; [s] time until which the robot must not fall; number of directions
 PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16
 GRAVITY = 9.81  # [m/s^2]
-LEVELS = 10  # of each kind of rough terrain
-SLOW = 0.1  # [m/s] slowest speed with a meaningful cost of transport
+LEVELS = 10  # difficulty levels of each kind of rough terrain
+SLOW = 0.1  # [m/s] lowest mean speed at which the cost of transport is computed
 EQUAL_DRIFT = 0.005  # [m] smaller drifts count as equal
-# Defaults: push speeds [m/s], the push speed that must be survived [m/s], what the marks measure, fixed marks
-# [m/s, m/s, rad/s]. A biped sways at each step, and its error at each time contains the sway. So its marks are of the
-# offset.
+# Defaults: push speeds [m/s], the push speed that must be survived [m/s], the error that the marks limit.
+# The base of a biped sways at each step, and its error at each time contains the sway. So its marks limit the offset.
 BIPED: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0), "push_mark": 1.0, "marks_of": "offset"}
 OTHERS: dict[str, Any] = {
     "push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0),
     "push_mark": 2.0,
     "marks_of": "error",
 }
-OFFSET_MARKS = (0.06, 0.06, 0.12)
+OFFSET_MARKS = (0.06, 0.06, 0.12)  # [m/s, m/s, rad/s]
 AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # name and unit of vx, vy, yaw rate
 
 Velocity = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s]: body frame, at the IMU
@@ -46,29 +45,29 @@ Ranges = tuple[tuple[float, float], ...]  # lowest and highest vx, vy [m/s], yaw
 
 
 class Peer(NamedTuple):
-    """A published policy: its figures, and the rules of its measurement."""
+    """A published policy with its figures and the exam rules of their measurement."""
 
     name: str
     asked: dict[str, Any]  # values of the ExamRules fields that affect its figures
     figures: dict[str, Any]  # the known keys of an exam's result
-    own_speed: bool = False  # pushes and cost of transport at half its own top speed, whatever the ranges
-    hard: dict[str, Any] | None = None  # its figures in the hard exam, in the common range
+    own_speed: bool = False  # pushes and cost of transport were measured at half of its own highest vx
+    hard: dict[str, Any] | None = None  # its figures in the hard exam, with the common command range
 
     def fits(self, rules: ExamRules) -> bool:
-        """Whether it was measured by the same commands and pushes as ``rules``."""
+        """Whether it was measured with the commands and pushes of ``rules``."""
         apart = ("push_vx", "transport_vx") if self.own_speed else ()
         return all(getattr(rules, name) == value for name, value in self.asked.items() if name not in apart)
 
 
 def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, float]]:
-    """Three tables by robot from ``resources/peers.yaml``: published policies, their common command ranges, their load [kg].
+    """Three tables by robot from ``resources/peers.yaml``: published policies, common command ranges, load [kg].
 
-    A policy that was measured both in its trained ranges and in the common range is listed twice.
+    A policy that was measured in its trained range and in the common range has two entries.
     """
     peers: dict[str, list[Peer]] = {}
     common: dict[str, Ranges] = {}
     loads: dict[str, float] = {}
-    # the project's own file: libyaml reads it in a ninth of the time of load_yaml, at each start of a training
+    # libyaml reads this file nine times as fast as load_yaml; every training reads it at its start
     text = (ROOT / "resources/peers.yaml").read_text(encoding="utf-8")
     for robot, said in yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
         speeds = tuple(said["push_speeds"])
@@ -91,21 +90,21 @@ def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, f
 
 
 PEERS, COMMON, LOADS = _read_peers()
-ALIASES = {"playground_go1": "go1"}  # older runs and exports name a policy
+ALIASES = {"playground_go1": "go1"}  # exam.peer of older runs and exports names a policy
 
 
 class Figure(NamedTuple):
-    """One figure of the exam, its pass mark, and the value of the peer or of the best of several peers."""
+    """One figure of the exam, its pass mark, and the peer's value, or the best value of several peers."""
 
     name: str
     value: float | None  # None: not measured
     digits: int
-    mark: float | None = None  # to pass as walking; None: any value
+    mark: float | None = None  # limit for the verdict "walks"; None: no limit
     peer: float | None = None
     more_is_better: bool = False
     without: str = "fell"  # printed in place of None
-    card: tuple[str, str] | None = None  # title and unit, for a figure among the cards at the top of the page
-    equal: float = 0.0  # values up to this one count as equal
+    card: tuple[str, str] | None = None  # title and unit, if a card at the top of the page has the figure
+    equal: float = 0.0  # values up to this one are equal
     peer_mark: str = ""  # footnote mark on the peer's value
 
     def text(self, value: float | None) -> str:
@@ -120,13 +119,13 @@ class Figure(NamedTuple):
         return f"{self.mark:.{min(self.digits, 2 if round(self.mark, 2) == self.mark else 3)}f}"
 
     def passes(self) -> bool | None:
-        """Whether the value reaches the mark; None without a mark."""
+        """Whether the value is within the mark; None without a mark."""
         if self.mark is None:
             return None
         return self.value is not None and (self.value >= self.mark if self.more_is_better else self.value <= self.mark)
 
     def reaches_peer(self) -> bool:
-        """Whether the value is as good as the peer's or better."""
+        """Whether the value is equal to the peer's value or better."""
         if self.value is None or self.peer is None:
             return False
         return self.value >= self.peer if self.more_is_better else self.value <= max(self.peer, self.equal)
@@ -134,20 +133,20 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class ExamRules:
-    """The commands, pushes and pass marks for one task: the config section ``exam`` with its defaults filled in."""
+    """The commands, pushes and pass marks of one task: the config section ``exam`` with all defaults."""
 
     ranges: tuple[tuple[float, float], ...]  # lowest and highest vx, vy [m/s], yaw rate [rad/s]
     push_speeds: tuple[float, ...]  # [m/s] jumps of the base's horizontal velocity
     push_vx: float  # [m/s] commanded vx during the pushes
     transport_vx: float  # [m/s] commanded vx for the cost of transport
-    marks: tuple[float, ...]  # largest mean error or offset to pass as walking [m/s, m/s, rad/s]
-    marks_of: str = "error"  # "error" at each time, or "offset" of the mean velocity
-    push_mark: float = 2.0  # [m/s] all pushes of this speed must be survived
+    marks: tuple[float, ...]  # largest mean error or offset for the verdict "walks" [m/s, m/s, rad/s]
+    marks_of: str = "error"  # "error": mean of the error at each time; "offset": error of the mean velocity
+    push_mark: float = 2.0  # [m/s] the robot must survive all pushes of this speed
     peer: str = ""  # the robot's key in PEERS
 
     @classmethod
     def from_config(cls, cfg: Any) -> ExamRules:
-        """The rules from the config of a task with velocity commands. Raises ConfigError."""
+        """The rules of a task with velocity commands, from its config. Raises ConfigError."""
         if not hasattr(cfg, "exam"):
             raise ConfigError(
                 "the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg"
@@ -158,10 +157,10 @@ class ExamRules:
     def from_mapping(
         cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None, feet: int = 0
     ) -> ExamRules:
-        """The rules from the config section ``exam`` or from ``to_mapping``. Missing fields get defaults.
+        """The rules from the config section ``exam`` or from ``to_mapping``. Missing fields get their defaults.
 
-        ``trained``: command -> (lowest, highest), for commands without a range in ``given``.
-        ``feet``: number of feet; a robot with two gets the easier defaults of a biped. Raises ConfigError.
+        ``trained``: command -> (lowest, highest), used for commands without a range in ``given``.
+        ``feet``: number of feet; a robot with two feet gets the defaults of a biped. Raises ConfigError.
         """
         said = {name: value for name, value in given.items() if value or name not in OTHERS}
         given = {"ranges": {}, "peer": "", **(BIPED if feet == 2 else OTHERS), **said}
@@ -179,18 +178,18 @@ class ExamRules:
         return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **kept)
 
     def to_mapping(self) -> dict[str, Any]:
-        """The inverse of ``from_mapping``, with values for JSON or YAML."""
+        """The rules as plain values for JSON or YAML, which ``from_mapping`` reads."""
         plain = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
         return {**plain, "ranges": {name: list(ends) for name, ends in zip(VELOCITY, self.ranges, strict=True)}}
 
     @property
     def peers(self) -> list[Peer]:
-        """The published policies of the robot that were measured by the same commands and pushes."""
+        """The robot's published policies that were measured with the same commands and pushes."""
         return [peer for peer in PEERS.get(self.peer, []) if peer.fits(self)]
 
     @property
     def peer_label(self) -> str:
-        """The heading above the figures of the peer or of the best of several peers; empty without peers."""
+        """The heading of the column with the peers' figures; empty without peers."""
         return f"best of {len(self.peers)}" if len(self.peers) > 1 else "peer" * len(self.peers)
 
     def asked_words(self) -> str:
@@ -206,7 +205,7 @@ class ExamRules:
         return f"asked: {', '.join(spans)}{common}"
 
     def peer_words(self) -> str:
-        """The peers as text. Says which of their figures were measured differently. Empty without peers."""
+        """A text about the peers and the figures that were measured differently. Empty without peers."""
         if not self.peers:
             return ""
         first = self.peers[0]
@@ -222,7 +221,7 @@ class ExamRules:
         ).strip()
 
     def commands(self) -> list[Velocity]:
-        """The 22 commands; the first is standing."""
+        """The 22 commands; the first one is zero."""
         (x0, x1), (y0, y1), (w0, w1) = self.ranges
         along = [(v, 0.0, 0.0) for v in (x1 / 3, 2 * x1 / 3, x1, x0 / 3, 2 * x0 / 3)]
         across = [(0.0, v, 0.0) for v in (y1 / 2, y1, y0 / 2, y0)]
@@ -232,12 +231,12 @@ class ExamRules:
         return [(round(vx, 4), round(vy, 4), round(yaw, 4)) for vx, vy, yaw in every]
 
     def held(self) -> list[Velocity]:
-        """The constant commands, one per world: the 22, and that of the cost of transport unless it is one of them."""
+        """The constant commands, one per world: the 22, then the command of the cost of transport if it is another."""
         ahead = (self.transport_vx, 0.0, 0.0)
         return self.commands() if ahead in self.commands() else [*self.commands(), ahead]
 
     def worlds(self) -> int:
-        """The number of worlds: one per constant command and one per push (speeds x directions)."""
+        """The number of worlds: one per constant command and per push (speed x direction)."""
         return len(self.held()) + len(self.push_speeds) * PUSH_DIRECTIONS
 
     def grade(
@@ -252,17 +251,17 @@ class ExamRules:
         """The exam's result from samples of N worlds, taken before each of T control steps of ``dt`` [s].
 
         ``signals``: velocity (T, N, 3) [m/s, m/s, rad/s]; position (T, N, 2) [m]; power (T, N) [W], the sum of
-        |torque * joint speed|; joint_speed (T, N) [rad/s], the mean over the joints; estimate (T, N, 2) [m/s], only for a
-        policy with a velocity estimator.
+        |torque * joint speed|; joint_speed (T, N) [rad/s], the mean over the joints; estimate (T, N, 2) [m/s], if the
+        policy has a velocity estimator.
         ``last_position`` (N, 2) [m]: after the last step. ``fell_at`` (N,): control step of the first fall, or inf.
-        ``mass`` [kg].
+        ``mass``: of the robot [kg].
         """
         velocity, position, power, joint_speed = (
             signals[name] for name in ("velocity", "position", "power", "joint_speed")
         )
         commands, held, settled = self.commands(), self.held(), round(SETTLING / dt)
         ahead, stood = held.index((self.transport_vx, 0.0, 0.0)), np.isinf(fell_at)
-        distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # along a straight line
+        distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # straight-line distance [m]
         energy = power[settled:, ahead].sum(dtype=float) * dt
         moved = stood[ahead] and distance[ahead] > SLOW * (len(velocity) - settled) * dt
         survived = (fell_at[len(held) :] > round(PUSH_UNTIL / dt)).reshape(-1, PUSH_DIRECTIONS).mean(axis=1)
@@ -285,17 +284,17 @@ class ExamRules:
         return {"walks": self.walks(result), **beats, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
-        """Whether the policy walks: no falls, errors (or offsets) within the marks, all pushes of the mark survived."""
+        """Whether the policy walks: no falls, errors or offsets within the marks, all pushes of ``push_mark`` survived."""
         if result["falls"]:
             return False
         small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
         return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
     def advise(self, errors: Sequence[float], falls: float, survived: float) -> list[str]:
-        """Three lines from the exam during training: what the policy can do, what it cannot, what to try next.
+        """Three lines from the exam during training: what the policy can do, what it cannot do, what to try next.
 
-        ``errors`` of vx, vy [m/s] and yaw rate [rad/s] are those of each step and contain the sway. So a robot whose
-        marks are of the offset may be off by twice the mark. ``falls``: of 22; ``survived``: the share of the pushes.
+        ``errors`` of vx, vy [m/s] and yaw rate [rad/s] contain the sway. So their limit is twice the mark if the marks
+        limit the offset. ``falls``: of 22 commands; ``survived``: share of the pushes (0 to 1).
         """
         most = [mark * (2.0 if self.marks_of == "offset" else 1.0) for mark in self.marks]
         able = {"stand at all 22 commands": not falls, f"survive pushes of {self.push_mark:g} m/s": survived == 1.0}
@@ -315,16 +314,16 @@ class ExamRules:
         ]
 
     def beats_peer(self, result: Mapping[str, Any]) -> bool:
-        """Whether the result is as good as each peer on every figure, and better on errors and cost of transport."""
+        """Whether the result is no worse than each peer in all figures, and better in errors and cost of transport."""
         return all(_beats(result, peer.figures) for peer in self.peers)
 
     def reached(self, result: Mapping[str, Any]) -> tuple[int, int]:
-        """The number of figures that are as good as the peers' best or better, and the number of compared figures."""
+        """The number of figures that are no worse than the peers' best, and the number of compared figures."""
         compared = [figure for figure in self.figures(result) if figure.peer is not None]
         return sum(figure.reaches_peer() for figure in compared), len(compared)
 
     def figures(self, result: Mapping[str, Any], others: Sequence[Mapping[str, Any]] = ()) -> list[Figure]:
-        """The figures of the result in the table's order, with a row for each figure that only ``others`` have."""
+        """The figures of the result in the table's order, including those that only ``others`` have."""
         peer, unknown_of_peer = best_of(self.peers), (None, None, None)
         apart = "*" if any(peer.own_speed for peer in self.peers) else ""
         listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
@@ -369,7 +368,7 @@ class ExamRules:
 def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
     """The tracking errors of C commands, from the velocities (T, C, 3) and the worlds that did not fall (C,).
 
-    A world that fell gets the error of standing still, so that a fall at a hard command does not improve the mean.
+    The error of a world that fell is its command, so that a fall at a hard command does not improve the mean.
     """
     asked = np.array(commands)
     difference = velocity - asked
@@ -388,7 +387,7 @@ def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[A
 
 
 def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
-    """Whether the result is as good as the peer on every figure, and better on errors and cost of transport."""
+    """Whether the result is no worse than the peer in all figures, and better in errors and cost of transport."""
     if result["falls"] > peer["falls"]:
         return False
     better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))
@@ -403,7 +402,7 @@ def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
 
 
 def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> None:
-    """Raise ConfigError for rules that cannot be applied."""
+    """Raise ConfigError if a rule is invalid."""
     for name in given["ranges"]:
         if name not in VELOCITY:
             raise ConfigError(
@@ -430,7 +429,7 @@ def robot_of(name: str) -> str:
 
 
 def best_of(peers: list[Peer]) -> dict[str, Any]:
-    """The best value of each figure over all ``peers``. One policy rarely has all of them."""
+    """The best value of each figure over all ``peers``; different peers may have them."""
 
     def best(values: list[Any]) -> Any:
         if isinstance(values[0], list):
@@ -443,9 +442,9 @@ def best_of(peers: list[Peer]) -> dict[str, Any]:
 
 
 def in_common(peer: str) -> dict[str, Any]:
-    """Fields of the config section ``exam`` with the common command range of the published policies of ``peer``.
+    """Fields of the config section ``exam`` for the common command range of the published policies of ``peer``.
 
-    Raises ConfigError if the robot has no common range.
+    Raises ConfigError if the robot has no common command range.
     """
     if (robot := robot_of(peer)) not in COMMON:
         raise ConfigError(
@@ -456,7 +455,7 @@ def in_common(peer: str) -> dict[str, Any]:
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """The result as text, with the pass marks and the values of the peer or of the best of several peers."""
+    """The result as a text table with the pass marks and the best values of the peers."""
     rules = ExamRules.from_mapping(result["rules"])
     label = rules.peer_label
     width = max(8, len(label) + 2) if label else 0
@@ -473,7 +472,7 @@ def table(result: Mapping[str, Any]) -> str:
 
 
 def verdicts(rules: ExamRules, result: Mapping[str, Any]) -> list[tuple[str, bool]]:
-    """The verdicts on a result, each with true or false."""
+    """The texts of a result's verdicts, each with its value."""
     several, (reached, count) = len(rules.peers) > 1, rules.reached(result)
     beats = f"beats all {len(rules.peers)} published policies (at or beyond their best in {reached} of {count} figures)"
     words = {"walks": "walks", "beats_peer": beats if several else "beats the peer"}

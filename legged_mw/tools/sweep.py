@@ -1,10 +1,10 @@
-"""legged-mw sweep --task NAME --seeds 1,2,3 --set a.b=1,2,3: a training for each combination, and a table of them at the end.
+"""legged-mw sweep --task NAME --seeds 1,2,3 --set a.b=1,2,3: train each combination, then print a table of the runs.
 
-Several values, apart by commas, make a training each; of several such fields every combination is trained. A list keeps its
-commas: --set actor.hidden_dims=[64,64],[128,128]. All other flags are those of train.
+Commas separate the values of a field. Every combination of the values is trained. Commas inside brackets belong to a
+list: --set actor.hidden_dims=[64,64],[128,128]. All other flags are those of train.
 
---halve drops settings early (successive halving): all train for --max_time, then the exam at the end of their training
-ranks them. The best third trains on for three times as long, and so on; the last one trains on alone.
+--halve stops bad settings early (successive halving). All settings train for --max_time, and the exam at the end ranks
+them. The best third trains for three times as long, and so on, until one setting is left, which trains a last round.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import check_name
 from legged_mw.utils.task import LoadedTask, load_task
 
-STOPPED = 3  # exit code of a training run that a signal ended, from rl/training.py
+STOPPED = 3  # exit code of a training that a signal stopped (rl/training.py)
 TRAIN = [sys.executable, "-m", "legged_mw.programs", "train"]
-THIRD = 3  # one of so many settings goes on, for so many times the time [Li et al. 2018, Hyperband: eta 3 or 4]
-NO_END = ["--max_iterations", "1000000"]  # of a training of --halve, which the time ends
-# figures of the walking exam during training -> whether more is better (eval/rollout.py)
+THIRD = 3  # eta: 1/eta of the settings continue, eta times as long [Li et al. 2018, Hyperband: eta 3 or 4]
+NO_END = ["--max_iterations", "1000000"]  # with --halve, --max_time ends a training
+# figure of the walking exam during training -> whether more is better (eval/rollout.py)
 WALKING = {"error_vx": False, "error_vy": False, "error_yaw": False, "falls": False, "pushes_survived": True}
-_PDEATHSIG = 1  # option of Linux's prctl
-_POLL = 0.1  # [s]
+_PDEATHSIG = 1  # PR_SET_PDEATHSIG of Linux's prctl
+_POLL = 0.1  # [s] polling interval
 
 
 class Cell(NamedTuple):
-    """One combination: its varied fields, field -> value."""
+    """One combination of values."""
 
-    varied: dict[str, str]
+    varied: dict[str, str]  # varied config field -> value
     flags: list[str]
 
     @property
@@ -60,7 +60,7 @@ class Cell(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name as a part of a file's name."""
+        """The name, with only characters that are valid in a file name."""
         return re.sub(r"[^\w.=-]+", "_", self.name).strip("_")
 
 
@@ -69,7 +69,7 @@ def _named(varied: Mapping[str, str]) -> str:
 
 
 class Training(NamedTuple):
-    """A call of ``legged-mw train``, and the file for all that it prints."""
+    """One call of ``legged-mw train`` and the file for its output."""
 
     name: str
     flags: list[str]
@@ -77,24 +77,24 @@ class Training(NamedTuple):
 
 
 class Printed(NamedTuple):
-    """What a training has printed."""
+    """The parsed output of a training."""
 
-    folder: str  # of its run, or ""
-    last: str  # the line that says how it ended
+    folder: str  # run folder, or ""
+    last: str  # line about the end of the training
     done: bool
-    left: str  # --max_time to go on with after a signal, or ""
-    exam: dict[str, float]  # figures of the exam at its end
-    failed: bool  # noted by the line of a shell
+    left: str  # remaining --max_time after a signal, or ""
+    exam: dict[str, float]  # figures of the exam at the end
+    failed: bool  # the shell command of ``Halving.line`` reported a failure
 
 
 class Stop:
-    """Notes a signal that ends the sweep."""
+    """A signal handler that records the request to end the sweep."""
 
     def __init__(self) -> None:
         self.asked = False
 
     def listen(self) -> None:
-        """Handle Ctrl-C, SIGTERM and SIGHUP, except signals that are ignored, as under nohup."""
+        """Handle Ctrl-C, SIGTERM and SIGHUP, except ignored signals, as under nohup."""
         for name in ("SIGINT", "SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)  # Windows has no SIGHUP
             if number and signal.getsignal(number) is not signal.SIG_IGN:
@@ -104,7 +104,7 @@ class Stop:
         self.asked = True
 
 
-# ---- what is asked
+# ---- the flags
 
 
 def parse() -> tuple[argparse.Namespace, list[str]]:
@@ -178,7 +178,7 @@ def values(text: str) -> list[str]:
 
 
 def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
-    """All combinations. The seed varies fastest."""
+    """All combinations of the values. The seed varies fastest."""
     axes = [
         [(path, value) for value in values(text) or [""]]
         for path, _, text in (item.partition("=") for item in settings)
@@ -195,7 +195,7 @@ def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
 
 
 def check(cells: Sequence[Cell], common: list[str]) -> tuple[argparse.Namespace, LoadedTask]:
-    """Parse all flags and values once, as train does. Raises UserError, or ends the program, for an invalid one."""
+    """Parse all flags and values once, as train does. An invalid one raises UserError or ends the program."""
     args = flags.parse(None, common)
     args.set += dict.fromkeys(text for cell in cells for text in cell.flags if text != "--set")
     apply_overrides(task := load_task(args.task, say=True), args)
@@ -206,9 +206,9 @@ def check(cells: Sequence[Cell], common: list[str]) -> tuple[argparse.Namespace,
 
 
 def train_all(trainings: Sequence[Training], at_once: int, stop: Stop) -> dict[int, Printed]:
-    """Train, and report each as it ends. Returns the logs of those that saved, by number.
+    """Run the trainings and print a line when one ends. Returns the logs of those that saved a checkpoint, by number.
 
-    If somebody else stops a training, it stops the sweep too.
+    A training that a signal stopped also stops the sweep.
     """
     ended: dict[int, Printed] = {}
     for done, (i, code) in enumerate(run(trainings, at_once, stop), 1):
@@ -222,11 +222,12 @@ def train_all(trainings: Sequence[Training], at_once: int, stop: Stop) -> dict[i
 
 
 def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tuple[int, int]]:
-    """Run ``at_once`` trainings at a time; yields number and exit code of each that ends. A terminal shows a last line.
+    """Run ``at_once`` trainings at a time. Yields the number and exit code of each training that ends.
 
-    After a signal no other begins, and each that runs gets one SIGTERM, so that it saves: a second would end it at once.
-    They are in process groups of their own, since a terminal, or ``timeout``, sends its signal to a whole group. Each has
-    its share of the cores: two that share them slow each other down many times (rl/runner.py, UpdateThreads).
+    After a signal no training starts, and each running one gets one SIGTERM, so that it saves a checkpoint. A second
+    signal would end it at once. So each training has its own process group, because a terminal or ``timeout`` sends a
+    signal to a whole group. Each has its own cores, because trainings on the same cores are many times slower
+    (rl/runner.py, UpdateThreads).
     """
     waiting, running, told = list(enumerate(trainings)), dict[int, subprocess.Popen[bytes]](), False
     shares, uses = shares_of(cores(), at_once), dict[int, int]()
@@ -248,25 +249,25 @@ def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tup
                     _show("")
                     yield i, code
     finally:
-        for process in running.values():  # of a sweep that fails
+        for process in running.values():  # only after an exception
             process.terminate()
 
 
 def cores() -> list[int]:
-    """The cores that this process may use; empty where the system does not say."""
+    """The cores that this process may use; empty if unknown."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def shares_of(cores: Sequence[int], count: int) -> list[Sequence[int]]:
-    """``count`` equal shares, of at least one core if there is any."""
+    """``count`` equal shares of ``cores``, each of at least one core unless ``cores`` is empty."""
     size = max(1, len(cores) // count)
     whole = max(1, len(cores) // size)
     return [cores[i % whole * size :][:size] for i in range(count)]
 
 
 def _start(training: Training, share: Sequence[int]) -> subprocess.Popen[bytes]:
-    """A child process that ends with this one. Called from the main thread, for ``preexec_fn``."""
-    with open(training.log, "ab") as log:  # one that is killed at once keeps what was there
+    """Start a child process that ends when this one ends. Call it in the main thread, as ``preexec_fn`` needs."""
+    with open(training.log, "ab") as log:  # append: the log may hold the output of earlier starts
         return subprocess.Popen(
             [*TRAIN, *training.flags],
             stdin=subprocess.DEVNULL,
@@ -278,7 +279,7 @@ def _start(training: Training, share: Sequence[int]) -> subprocess.Popen[bytes]:
 
 
 def _first(parent: int, share: Sequence[int]) -> Callable[[], object] | None:
-    """The first function of a child: it takes its cores, and gets SIGTERM at any end of ``parent``. None if not on Linux."""
+    """A ``preexec_fn`` that sets the child's cores and sends it SIGTERM when ``parent`` ends. None if not on Linux."""
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None).prctl
@@ -293,7 +294,7 @@ def _first(parent: int, share: Sequence[int]) -> Callable[[], object] | None:
 
 
 def _show(line: str) -> None:
-    """On a terminal, in place of the line before."""
+    """Replace the last line of a terminal."""
     if sys.stdout.isatty():
         print(f"\r\x1b[K{line[:100]}", end="", flush=True)
 
@@ -306,7 +307,7 @@ def _last_iteration(log: Path) -> str:
 
 
 def read_printed(file: Path) -> Printed:
-    """What is known of a training from what it printed, at one start after the other; all empty without the file."""
+    """Parse the output of all starts of a training. Without the file all fields are empty."""
     text = file.read_text(errors="replace").strip() if file.is_file() else ""
 
     def last(pattern: str) -> str:
@@ -329,10 +330,10 @@ def read_printed(file: Path) -> Printed:
 
 
 class Halving:
-    """The rounds of a sweep. All that is known of them is what the trainings have printed, into files of ``folder``."""
+    """The rounds of a sweep. Their state is read from the trainings' output files in ``folder``."""
 
     def __init__(self, args: argparse.Namespace, cells: Sequence[Cell], common: list[str]) -> None:
-        """Raises UserError if the sweep cannot be halved, or ``folder`` holds another one."""
+        """Raises UserError if --halve is not possible or ``folder`` holds another sweep."""
         asked, self.task = check(cells, common)
         if len({cell.setting for cell in cells}) < 2:
             raise UserError("--halve chooses between settings, and there is one: give several values, --set PATH=V,V,V")
@@ -365,7 +366,7 @@ class Halving:
         return read_printed(self.file(cell, number))
 
     def training(self, cell: Cell, number: int) -> Training:
-        """The training of round ``number``: a new run in the first one; a run that a signal stopped gets the time left."""
+        """The training of round ``number``. Round 1 starts a new run. A stopped run gets its remaining time."""
         begun, before = self.log(cell, number), self.log(cell, number - 1)
         run = begun.folder if begun.left else before.folder
         words = ["--max_time", begun.left or f"{self.seconds * THIRD ** (number - 1):g}s"]
@@ -373,21 +374,21 @@ class Halving:
         return Training(cell.name, [*self.common, *cell.flags, *words], self.file(cell, number))
 
     def line(self, cell: Cell, number: int) -> str:
-        """``training`` for a shell, which notes a failure in the file: the line is not printed again."""
+        """A shell command of ``training``. It writes a failure to the log file, and then it is not printed again."""
         training = self.training(cell, number)
         file = shlex.quote(shown(training.log))
         return f"{command('train')} {shlex.join(training.flags)} >> {file} 2>&1 || echo failed: code $? >> {file}"
 
     def rounds(self, cell: Cell) -> int:
-        """How many rounds its training has done."""
+        """The number of completed rounds."""
         return next(number for number in count() if not self.log(cell, number + 1).done)
 
     def last(self, cell: Cell) -> Printed:
-        """The log of the last round that is done."""
+        """The log of the last completed round."""
         return self.log(cell, self.rounds(cell))
 
     def found(self, places: Sequence[str]) -> list[tuple[Cell, Run]]:
-        """All that have done a round, with their number of rounds; the best setting first."""
+        """The runs with a completed round and their number of rounds, in the order of ``places``: best setting first."""
         cells = sorted(self.cells, key=lambda cell: places.index(cell.setting))
         return [
             (cell._replace(varied={**cell.varied, "rounds": str(self.rounds(cell))}), find_runs([log.folder])[0])
@@ -397,10 +398,10 @@ class Halving:
 
 
 def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
-    """Train round after round. Rounds that are done, of an earlier call or by a cluster, are not trained again."""
+    """Train all rounds. Rounds that an earlier call or a cluster has completed are not trained again."""
     places, failed = list(dict.fromkeys(cell.setting for cell in halving.cells)), False
     left, better = places, ranked_figures(halving.task.exam)
-    out = sys.stderr if args.print else sys.stdout  # a shell runs what --print prints
+    out = sys.stderr if args.print else sys.stdout  # with --print, stdout has only shell commands
     stop.listen()
     for number in count(1):
         able = [cell for cell in halving.cells if cell.setting in left and halving.rounds(cell) >= number - 1]
@@ -443,7 +444,7 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
 
 
 def ranked_figures(exam: str) -> dict[str, bool]:
-    """The figures with a mark of the exam during training -> whether more is better."""
+    """Figure of the exam during training that has a mark -> whether more is better."""
     from legged_mw.eval.skills import SKILLS  # imports MuJoCo
 
     if exam not in SKILLS:
@@ -452,12 +453,12 @@ def ranked_figures(exam: str) -> dict[str, bool]:
 
 
 def rank(exams: Mapping[str, Sequence[Mapping[str, float]]], better: Mapping[str, bool]) -> list[str]:
-    """Names, best first: by their place in each figure, averaged over the figures. Those that lack an exam come last.
+    """Names by their mean rank over all figures, best first. Names with a missing exam are last.
 
-    ``exams``: name -> figures of each of its trainings, empty without an exam; a figure counts by its mean.
+    ``exams``: name -> figures of each of its trainings, empty without an exam. Each figure is averaged over them.
     """
     most = max(len(each) for each in exams.values())
-    worth: dict[str, list[float]] = {}  # of each figure: more is better, -inf if nobody has it
+    worth: dict[str, list[float]] = {}  # name -> score per figure: more is better, -inf if unknown
     for name, each in exams.items():
         means = [
             mean(exam.get(figure, math.nan) for exam in each if exam) if any(each) else math.nan for figure in better
@@ -479,7 +480,7 @@ def rank(exams: Mapping[str, Sequence[Mapping[str, float]]], better: Mapping[str
 
 
 def table(found: Sequence[tuple[Cell, Run]]) -> str:
-    """One line per run. With several seeds, then mean and standard deviation for each setting."""
+    """One line per run. Several seeds add the mean and standard deviation of each setting."""
     fields = list(dict.fromkeys(path for cell, _ in found for path in cell.varied))
     (_, *heads), *lines = rows(runs := [run for _, run in found])
     short = [path.rpartition(".")[2] for path in fields]
@@ -501,7 +502,7 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
 def _mean(digits: str, values: Sequence[float | None]) -> str:
     """Mean and standard deviation as text; "-" if a value is missing.
 
-    It has the figure's ``digits``, or more to show two digits of the deviation.
+    The text has the figure's ``digits``, or more to show two digits of the deviation.
     """
     numbers = [value for value in values if value is not None and math.isfinite(value)]
     if len(numbers) < len(values):
