@@ -81,7 +81,7 @@ class _Walked:
     """Measurements since the command changed, one entry per control period."""
 
     torque: list[Floats]  # (D,) [N m]
-    asked: list[Floats]  # (D,) [N m] requested: stiffness x position error
+    requested: list[Floats]  # (D,) [N m] stiffness x position error
     tilt: list[float]  # [rad]
     turn: list[float]  # [rad/s] about the body's z axis
     velocity: list[Floats]  # (2,) [m/s] by leg odometry, body frame
@@ -123,7 +123,7 @@ class FirstWalk(JointCheck):
         self._robot, self._exam, self._odometry = robot, exam, Odometry(controller.folder, contract, 1, "torque")
         self.values, self.found = list[Value](), dict[tuple[str, str], Floats]()
         self.at, self.wants, self.ended = HANGING, "", ""  # step; next button; why the walk ended
-        self._asked, self._now, self._steps = self._velocity(), 0.0, self._all()
+        self._walk_command, self._now, self._steps = self._velocity(), 0.0, self._all()
         self._walked, self._judged = _Walked([], [], [], [], [], []), 0
         next(self._steps)
 
@@ -138,7 +138,7 @@ class FirstWalk(JointCheck):
 
     def listen(self, health: Health, now: float) -> Trip | None:
         stop = super().listen(health, now)
-        self.command = self._asked  # the joysticks have no effect
+        self.command = self._walk_command  # the joysticks have no effect
         return stop
 
     def step(self, measured: Measurement, now: float) -> Order:
@@ -151,8 +151,8 @@ class FirstWalk(JointCheck):
             return self._steps.send(measured)
         except StopIteration:
             self.ended = "the first walk is done"
-        except Differs as why:
-            self.ended = str(why)
+        except Differs as reason:
+            self.ended = str(reason)
         self._enter(DAMPING, now, self.ended)
         return Order(DAMPING)
 
@@ -230,17 +230,17 @@ class FirstWalk(JointCheck):
 
     def _stands(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
         """Compare the weight on the legs, computed from their torques, and the torque of each motor."""
-        carried, torques, asked = [], [], []
+        weights, torques, requested = [], [], []
         for _ in range(self._periods(LOOK)):
             order = self._stand(measured, self._now)
             assert order.targets is not None and order.stiffness is not None
-            carried.append(self._odometry.legs(measured).force.sum() / self._odometry.gravity)
+            weights.append(self._odometry.legs(measured).force.sum() / self._odometry.gravity)
             torques.append(measured.joint_torque.copy())
-            asked.append(order.stiffness * (order.targets - measured.joint_pos))
+            requested.append(order.stiffness * (order.targets - measured.joint_pos))
             measured = yield order
         if len(self.controller.contract.feet) > 2:  # the rope holds a biped until the policy starts
-            self._compare("weight on the legs", "kg", np.mean(carried), 0.0, CARRIED)
-            self._compare_torque("torque", torques, asked, STANDS)
+            self._compare("weight on the legs", "kg", np.mean(weights), 0.0, CARRIED)
+            self._compare_torque("torque", torques, requested, STANDS)
         self._judge()
         return measured
 
@@ -267,7 +267,7 @@ class FirstWalk(JointCheck):
         self._odometry.reset()
         measured = yield from self._walk(measured, self._velocity(), lambda: self._lasted >= CALM + LOOK)
         last = slice(-self._periods(LOOK), None)
-        self._compare_torque("torque at rest", self._walked.torque[last], self._walked.asked[last], WALKS)
+        self._compare_torque("torque at rest", self._walked.torque[last], self._walked.requested[last], WALKS)
         self._compare("largest tilt at rest", "deg", math.degrees(max(self._walked.tilt)), TILT)
         self._judge()
         done = "time of ten steps"
@@ -318,7 +318,7 @@ class FirstWalk(JointCheck):
 
         Raises Differs if the time limit is reached.
         """
-        self._asked, self._walked = command, _Walked([], [], [], [], [], [])
+        self._walk_command, self._walked = command, _Walked([], [], [], [], [], [])
         exam = None if self._exam is None or not timed else self._exam[self.at, timed]
         longest = LONGEST if exam is None else PATIENCE * float(exam[0])
         while not (self._walked.tilt and done()):
@@ -329,7 +329,7 @@ class FirstWalk(JointCheck):
 
     def _rest(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
         """Run the policy for one control period with the command zero."""
-        self._asked = self._velocity()
+        self._walk_command = self._velocity()
         return (yield from self._act(measured))
 
     def _act(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
@@ -340,10 +340,10 @@ class FirstWalk(JointCheck):
         walked.turn.append(float(measured.ang_vel[2]))
         walked.velocity.append(estimate.lin_vel[:2].copy())
         walked.stands.append(self._odometry.stands(measured, self._odometry.legs(measured))[0])
-        self.controller.act(measured, self._asked)
+        self.controller.act(measured, self._walk_command)
         targets = self.controller.last_targets[0].copy()
-        held = np.clip(targets, self._limits.lowest, self._limits.highest)
-        walked.asked.append(self.controller.contract.stiffness * (held - measured.joint_pos))
+        clipped = np.clip(targets, self._limits.lowest, self._limits.highest)
+        walked.requested.append(self.controller.contract.stiffness * (clipped - measured.joint_pos))
         return (yield Order(POLICY, targets))
 
     def _want(self, button: str, note: str, state: str = "") -> None:
@@ -373,14 +373,14 @@ class FirstWalk(JointCheck):
         """(D,) [N m] largest torque of the motors; 20 if unknown."""
         return np.where(np.isfinite(self._limits.motor), self._limits.motor, 20.0)
 
-    def _compare_torque(self, name: str, torques: Sequence[Floats], asked: Sequence[Floats], share: float) -> None:
+    def _compare_torque(self, name: str, torques: Sequence[Floats], requested: Sequence[Floats], share: float) -> None:
         """Compare mean torques (N, D) with the exam's, and with the requested torques: a weak motor gives less.
 
         If a motor reports its requested torque instead, the torque or the weight on the legs differs from the exam's.
         """
         torque = np.mean(torques, axis=0)
-        short = np.abs(np.mean(asked, axis=0) - torque)
-        self._compare(f"{name}, less than asked", "N m", short, np.maximum(SHORT, SHARE * np.abs(torque)))
+        deficit = np.abs(np.mean(requested, axis=0) - torque)
+        self._compare(f"{name}, less than asked", "N m", deficit, np.maximum(SHORT, SHARE * np.abs(torque)))
         self._compare(name, "N m", torque, share * self._motor_torque, SHARE)
 
     def _compare(self, name: str, unit: str, measured: Any, least: float | Floats, share: float = 0.0) -> None:
@@ -390,9 +390,9 @@ class FirstWalk(JointCheck):
         exam = measured if self._exam is None else self._exam[self.at, name]
         allowed = np.maximum(least, share * np.abs(exam))
         worst = int(np.argmax(np.abs(measured - exam) / np.maximum(allowed, 1e-9)))
-        who = f" of {self.joints[worst]}" if len(measured) > 1 else ""
+        joint_name = f" of {self.joints[worst]}" if len(measured) > 1 else ""
         self.values.append(
-            Value(self.at, name + who, unit, *(float(each[worst]) for each in (measured, exam, allowed)))
+            Value(self.at, name + joint_name, unit, *(float(each[worst]) for each in (measured, exam, allowed)))
         )
 
     def _judge(self) -> None:
@@ -419,7 +419,7 @@ def _tilt(measured: Measurement) -> float:
 # ---- the exam's robot
 
 
-class _Willing:
+class _ButtonPresser:
     """An input source that presses the next button at once."""
 
     def __init__(self) -> None:
@@ -438,9 +438,9 @@ def first_walk(
     robot: Robot, folder: Path, contract: Contract, exam: Mapping[tuple[str, str], Floats] | None = None
 ) -> FirstWalk:
     """The first walk of a simulated ``robot`` that starts hanging. Each button is pressed at once."""
-    controller, willing = Controller(folder, contract), _Willing()
+    controller, source = Controller(folder, contract), _ButtonPresser()
     limits = Limits.of(folder, contract, robot.limits)
-    walk = willing.walk = FirstWalk(controller, [willing], lambda _: None, robot, limits, exam)
+    walk = source.walk = FirstWalk(controller, [source], lambda _: None, robot, limits, exam)
     run(robot, controller, lambda _: np.zeros(0), live=False, safety=Safety(contract, limits), states=walk)
     return walk
 

@@ -68,17 +68,17 @@ def main(export: Export) -> None:
     """Run the program. ``export`` exports a run that has no export; it needs torch."""
     args = parse()
     before = read_result(typed(args.against)) if args.against else None
-    with TemporaryDirectory() as place:
+    with TemporaryDirectory() as scratch:
         folders = [
-            find_export(name, args.checkpoint) or _exported(export, name, args.checkpoint, Path(place, str(i)))
+            find_export(name, args.checkpoint) or _exported(export, name, args.checkpoint, Path(scratch, str(i)))
             for i, name in enumerate(args.policies)
         ]
-        asked = [asked_of(folder, args) for folder in folders]
-        for name, other in zip(args.policies[1:], asked[1:], strict=True):
-            check_alike(other, asked[0], name, args.policies[0])
+        requests = [asked_of(folder, args) for folder in folders]
+        for name, other in zip(args.policies[1:], requests[1:], strict=True):
+            check_alike(other, requests[0], name, args.policies[0])
         if before:
-            check_alike(asked[0], before, args.policies[0], args.against)
-        result = examine(folders, asked[0], args)
+            check_alike(requests[0], before, args.policies[0], args.against)
+        result = examine(folders, requests[0], args)
     marks = fallen(result, before) if before else []
     print(table(result, before))
     if args.json:
@@ -131,20 +131,20 @@ def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
         rules = contract_rules(contract, args.ranges == "common")
         exam = {"kind": "walking", "hard": bool(contract.feet) and not args.no_hard, "rules": rules.to_mapping()}
         exam |= {"scene": typed(args.scene).name} if args.scene else {}
-    said = {"exam": {**exam, "version": VERSION}, "robot": {"joints": list(contract.joints)}}
-    return json.loads(json.dumps(said))  # tuples become lists, as in a result file
+    request = {"exam": {**exam, "version": VERSION}, "robot": {"joints": list(contract.joints)}}
+    return json.loads(json.dumps(request))  # tuples become lists, as in a result file
 
 
-def check_alike(asked: Mapping[str, Any], other: Mapping[str, Any], name: str, against: str) -> None:
+def check_alike(request: Mapping[str, Any], other: Mapping[str, Any], name: str, against: str) -> None:
     """Raise UserError if the exam or the robot of two results differ."""
-    for place in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "scene", "hard", "rules"))):
-        mine, theirs = (said[place[0]].get(place[1]) for said in (asked, other))
-        if mine != theirs:
-            if isinstance(mine, dict) and isinstance(theirs, dict):
-                key = next(key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key))
-                place, mine, theirs = (*place, key), mine.get(key), theirs.get(key)
-            what = f"{': '.join(place)} is {_short(mine)} of {name} and {_short(theirs)} of {against}"
-            raise UserError(f"{what}: one exam of one robot is compared; write a new result with --json FILE")
+    for path in (("robot", "joints"), *(("exam", key) for key in ("kind", "version", "scene", "hard", "rules"))):
+        value, other_value = (each[path[0]].get(path[1]) for each in (request, other))
+        if value != other_value:
+            if isinstance(value, dict) and isinstance(other_value, dict):
+                key = next(key for key in {**value, **other_value} if value.get(key) != other_value.get(key))
+                path, value, other_value = (*path, key), value.get(key), other_value.get(key)
+            difference = f"{': '.join(path)} is {_short(value)} of {name} and {_short(other_value)} of {against}"
+            raise UserError(f"{difference}: one exam of one robot is compared; write a new result with --json FILE")
 
 
 def _short(value: Any) -> str:
@@ -162,17 +162,17 @@ class Repeat(NamedTuple):
     figures: list[Figure]  # figures with a mark
 
 
-def examine(folders: Sequence[Path], asked: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+def examine(folders: Sequence[Path], request: Mapping[str, Any], args: argparse.Namespace) -> dict[str, Any]:
     """Grade all exports with all seeds. Returns the result as plain values for JSON."""
     repeats, seeds = [], range(args.seed, args.seed + args.seeds)
     for name, folder in zip(args.policies, folders, strict=True):
         for seed in seeds:
-            repeats.append(graded := grade(folder, asked["exam"], seed, args))
+            repeats.append(graded := grade(folder, request["exam"], seed, args))
             words = ", ".join(f"{word}: {'yes' if yes else 'no'}" for word, yes in graded.verdicts.items())
             print(f"{name}, seed {seed}: {words}", flush=True)
     contracts = [read_contract(folder, args.edited) for folder in folders]
     return {
-        **asked,
+        **request,
         "task": contracts[0].task,
         "policies": [
             {"policy": name, "sha256": contract.digest} for name, contract in zip(args.policies, contracts, strict=True)
@@ -199,12 +199,12 @@ def grade(folder: Path, exam: Mapping[str, Any], seed: int, args: argparse.Names
         return Repeat({"passes": result["passed"]}, named(each))
     rules, scene = ExamRules.from_mapping(exam["rules"]), typed(args.scene) if args.scene else SCENE_FILE
     result = run_exam(folder, rules, edited=args.edited, scene=scene, seed=seed)
-    said, figures = {"walks": result["walks"]}, rules.figures(result)
+    verdicts, figures = {"walks": result["walks"]}, rules.figures(result)
     if exam["hard"]:
-        harder, _ = run_hard(folder, rules, result["walks"], args.edited, scene, seed)
-        said["ready for a robot"] = harder["ready"]
-        figures += [*condition_figures(harder), *hard.figures(harder)]
-    return Repeat(said, named(figures))
+        hard_result, _ = run_hard(folder, rules, result["walks"], args.edited, scene, seed)
+        verdicts["ready for a robot"] = hard_result["ready"]
+        figures += [*condition_figures(hard_result), *hard.figures(hard_result)]
+    return Repeat(verdicts, named(figures))
 
 
 def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
@@ -219,12 +219,12 @@ def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
 
 def named(figures: Sequence[Figure]) -> list[Figure]:
     """The figures with a mark. The name of the row above is added to an indented row, so that names are unique."""
-    found, above = [], ""
+    result, parent = [], ""
     for figure in figures:
-        above = above if figure.name.startswith(" ") else figure.name
-        name = f"{above}, {figure.name.strip()}" if figure.name.startswith(" ") else figure.name
-        found += [figure._replace(name=name)] if figure.mark is not None else []
-    return found
+        parent = parent if figure.name.startswith(" ") else figure.name
+        name = f"{parent}, {figure.name.strip()}" if figure.name.startswith(" ") else figure.name
+        result += [figure._replace(name=name)] if figure.mark is not None else []
+    return result
 
 
 def marks_of(repeats: Sequence[Sequence[Figure]]) -> list[dict[str, Any]]:
@@ -255,8 +255,8 @@ def marks_of(repeats: Sequence[Sequence[Figure]]) -> list[dict[str, Any]]:
 def commit() -> str:
     """The commit of the repository in the current folder, with -dirty if files are changed; "" without git."""
     try:
-        asked = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-        return subprocess.run(asked, capture_output=True, text=True, timeout=10).stdout.strip()
+        words = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        return subprocess.run(words, capture_output=True, text=True, timeout=10).stdout.strip()
     except (OSError, subprocess.TimeoutExpired):
         return ""
 
@@ -293,11 +293,11 @@ def read_result(file: Path) -> dict[str, Any]:
     try:
         names = [each["name"] for each in result["marks"]]
         numbers = [each[key] for each in result["marks"] for key in ("mean", "tolerance", "digits")]
-        good = bool(names) and all(isinstance(number, int | float | None) for number in numbers)
-        good = good and isinstance(result["robot"], dict) and isinstance(result["exam"], dict)
+        valid = bool(names) and all(isinstance(number, int | float | None) for number in numbers)
+        valid = valid and isinstance(result["robot"], dict) and isinstance(result["exam"], dict)
     except (LookupError, TypeError):
-        good = False
-    if not good:
+        valid = False
+    if not valid:
         raise UserError(f"--against {shown(file)}: no result of this program; {advice}")
     return result
 
@@ -315,8 +315,8 @@ def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
         tolerance = max(was["tolerance"], new["range"])
         worse = was["mean"] - new["mean"] if was["more_is_better"] else new["mean"] - was["mean"]
         if worse > tolerance:
-            more = f"tolerance {tolerance:.{max(digits, 3)}f}, mark {was['mark']:g}"
-            lines.append(f"{was['name']}: {new['mean']:.{digits}f}, was {was['mean']:.{digits}f} ({more})")
+            details = f"tolerance {tolerance:.{max(digits, 3)}f}, mark {was['mark']:g}"
+            lines.append(f"{was['name']}: {new['mean']:.{digits}f}, was {was['mean']:.{digits}f} ({details})")
     return lines
 
 

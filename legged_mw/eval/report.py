@@ -110,43 +110,41 @@ def _hard(column: Column) -> str:
     """The section of the hard exam: results by condition, gait figures, pictures of one stride."""
     result = column.exam["hard"]
     heads, *rows = hard.condition_rows(result)
-    looked = (
-        exam_table([column], [hard.figures(result)], hard.peer_label(result), "ready at") if result["looks"] else ""
-    )
-    missed = f"<p>Not ready: {escape('; '.join(result['misses']))}.</p>" if result["misses"] else ""
+    gait = exam_table([column], [hard.figures(result)], hard.peer_label(result), "ready at") if result["looks"] else ""
+    misses = f"<p>Not ready: {escape('; '.join(result['misses']))}.</p>" if result["misses"] else ""
     lead = TEXTS["hard"].format(count=len(result["commands"]), pushes=hard.PUSH_DIRECTIONS, vx=result["vx"])
     strip = picture(column.strip, "one stride, from the side and from the front") if column.strip else ""
-    said = f'<p class="lead">{lead}</p>{pill("ready for a robot", "not ready for a robot", result["ready"])}{missed}'
-    return f"<section><h2>Hard exam</h2>{said}{table(heads, rows)}{looked}{strip}</section>"
+    summary = f'<p class="lead">{lead}</p>{pill("ready for a robot", "not ready for a robot", result["ready"])}{misses}'
+    return f"<section><h2>Hard exam</h2>{summary}{table(heads, rows)}{gait}{strip}</section>"
 
 
 def _heats(columns: Sequence[Column]) -> str:
     """The section of heat and power for each column: the verdict, one line per result, one row per motor."""
     chapters = []
     for result in (column.exam["heat"] for column in columns if "heat" in column.exam):
-        *said, _ = (f"<li>{escape(line)}</li>" for line in heat.lines(result))
+        *findings, _ = (f"<li>{escape(line)}</li>" for line in heat.lines(result))
         heads, *rows = heat.rows(result)
         verdict = f"<p><b>Will it trip?</b> {escape(heat.verdict(result))}</p>"
         lead = f'<p class="lead">{TEXTS["heat"]}</p>'
-        body = f"{lead}{verdict}<ul>{''.join(said)}</ul>{table(heads, rows, 'Motor by motor')}"
+        body = f"{lead}{verdict}<ul>{''.join(findings)}</ul>{table(heads, rows, 'Motor by motor')}"
         chapters.append(f"<section><h2>Heat and power</h2>{body}</section>")
     return "".join(chapters)
 
 
 def _names(columns: Sequence[Column], rules: ExamRules) -> str:
     """The list of policies with their verdicts and the colours of their curves."""
-    items, drawn = [], [column.name for column in columns if column.figures]
+    items, plotted = [], [column.name for column in columns if column.figures]
     for column in columns:
-        swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
+        swatch = f'<i class="swatch c{plotted.index(column.name)}"></i>' if column.figures and len(plotted) > 1 else ""
         engine = escape(str(column.about.get("engine", "")))
-        pills = [pill(*_said(words), yes) for words, yes in verdicts(rules, column.exam)]
+        pills = [pill(*_verdict_texts(words), yes) for words, yes in verdicts(rules, column.exam)]
         items.append(
             f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>"
         )
     return f'<ul class="names">{"".join(items)}</ul>'
 
 
-def _said(words: str) -> tuple[str, str]:
+def _verdict_texts(words: str) -> tuple[str, str]:
     """The texts of a verdict such as ``walks``, if true and if false."""
     verb, _, rest = words.partition(" ")
     return words, f"does not {verb.removesuffix('s')} {rest}".strip()
@@ -170,12 +168,12 @@ def _cards(figures: Sequence[Figure]) -> str:
                 else figure.text(figure.value)
             )
             cards.append(
-                f'<div class="card{_mood(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>'
+                f'<div class="card{_pass_class(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>'
             )
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
-def _mood(figure: Figure) -> str:
+def _pass_class(figure: Figure) -> str:
     return {True: " pass", False: " fail", None: ""}[figure.passes()]
 
 
@@ -185,12 +183,12 @@ def exam_table(
     """A table with one row per figure. Each column after the first also shows its difference to the first."""
     lines = []
     for first, *others in zip(*figures, strict=True):
-        cells = [f'<td><span class="value{_mood(first)}">{first.text(first.value)}</span></td>']
+        cells = [f'<td><span class="value{_pass_class(first)}">{first.text(first.value)}</span></td>']
         for other in others:
             gap = "" if other.value is None or first.value is None else f"{other.value - first.value:+.{first.digits}f}"
             gap = gap if gap.strip("+-0.") else ""
             cells.append(
-                f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>'
+                f'<td><span class="value{_pass_class(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>'
             )
         cells.append(f"<td>{first.mark_text()}</td>")
         if peer:
@@ -220,13 +218,13 @@ def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
         "at vx [m/s]",
     ]
     cells = []
-    for name, found, vx in [*rows, *peers]:
+    for name, result, vx in [*rows, *peers]:
         digits = {"error": 3, "worst": 2, "offset": 3}
-        triples = [", ".join(f"{value:.{each}f}" for value in found[key]) for key, each in digits.items()]
-        drift = "fell" if found["drift"] is None else f"{found['drift']:.3f}"
-        cost = "none" if found["cost_of_transport"] is None else f"{found['cost_of_transport']:.2f}"
-        shares = ", ".join(f"{100 * share:.0f}" for share in found["pushes"].values())
-        cells.append([name, str(found["falls"]), *triples, drift, cost, shares, vx])
+        triples = [", ".join(f"{value:.{each}f}" for value in result[key]) for key, each in digits.items()]
+        drift = "fell" if result["drift"] is None else f"{result['drift']:.3f}"
+        cost = "none" if result["cost_of_transport"] is None else f"{result['cost_of_transport']:.2f}"
+        shares = ", ".join(f"{100 * share:.0f}" for share in result["pushes"].values())
+        cells.append([name, str(result["falls"]), *triples, drift, cost, shares, vx])
     pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
     lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
     return (
@@ -243,8 +241,8 @@ def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
 
 def _extra(name: str, columns: Sequence[Column]) -> str:
     """The table below a section's plots. The rows of two policies alternate."""
-    drawn = [column for column in columns if column.figures]
-    figures: dict[str, Any] = drawn[0].figures or {}
+    plotted = [column for column in columns if column.figures]
+    figures: dict[str, Any] = plotted[0].figures or {}
     tables = {
         "crossing": (_crossing_rows, ["", *(f"level {i}" for i in range(LEVELS)), "mean"], "Every share"),
         "steps": (_step_rows, ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], ""),
@@ -259,45 +257,45 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
         return ""
     make, heads, folded = tables[name]
     # zip_longest: the policies' command ranges may differ
-    paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))
+    paired = zip_longest(*(make(column, f", {column.name}" if len(plotted) > 1 else "") for column in plotted))
     return table(heads, [row for rows in paired for row in rows if row], folded)
 
 
-def _crossing_rows(column: Column, whose: str) -> list[list[str]]:
+def _crossing_rows(column: Column, suffix: str) -> list[list[str]]:
     rows = []
     for name, kind in (column.figures or {}).get("crossing", {"kinds": {}})["kinds"].items():
         for which in ("crossed", "fell"):
             shares = [*kind[which], fmean(kind[which])]
-            rows.append([f"{name.replace('_', ' ')}, {which}{whose}", *(f"{share:.1%}" for share in shares)])
+            rows.append([f"{name.replace('_', ' ')}, {which}{suffix}", *(f"{share:.1%}" for share in shares)])
     return rows
 
 
-def _step_rows(column: Column, whose: str) -> list[list[str]]:
+def _step_rows(column: Column, suffix: str) -> list[list[str]]:
     rows = []
     for name, unit in AXES:
         for number in (column.figures or {})["steps"][name.removesuffix(" rate")]["numbers"]:
             rise, over, left = number["rise_time"], number["overshoot"], number["left"]
-            rose = "not reached" if rise is None else f"{rise:.2f}"
+            reached = "not reached" if rise is None else f"{rise:.2f}"
             rest = ["" if over is None else f"{over:.0%}", "" if left is None else f"{left:+.3f}"]
-            rows.append([f"{name} [{unit}]{whose}", f"{number['from']:g}", f"{number['to']:g}", rose, *rest])
+            rows.append([f"{name} [{unit}]{suffix}", f"{number['from']:g}", f"{number['to']:g}", reached, *rest])
     return rows
 
 
-def _gait_rows(column: Column, whose: str) -> list[list[str]]:
+def _gait_rows(column: Column, suffix: str) -> list[list[str]]:
     rows = []
     for gait in (column.figures or {})["gait"]:
-        name = ", ".join(f"{v:g}" for v in gait["command"]) + whose
+        name = ", ".join(f"{v:g}" for v in gait["command"]) + suffix
         strides, duty = gait["stride_frequency"], gait["duty_factor"]
         rows.append([name, "fell"] if duty is None else [name, f"{strides:.2f}", *(f"{share:.0%}" for share in duty)])
     return rows
 
 
-def _joint_rows(column: Column, whose: str) -> list[list[str]]:
+def _joint_rows(column: Column, suffix: str) -> list[list[str]]:
     rows = []
     for i, joint in enumerate((column.figures or {})["joint_names"]):
         shares = [(column.figures or {})["joints"][key]["saturated"] for key in ("dof_pos", "dof_vel", "torque")]
         cells = ["" if not each else "no limit known" if each[i] is None else f"{each[i]:.2%}" for each in shares]
-        rows.append([joint.removesuffix("_joint") + whose, *cells])
+        rows.append([joint.removesuffix("_joint") + suffix, *cells])
     return rows
 
 
@@ -307,8 +305,8 @@ def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
     body = "".join(
         f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows
     )
-    drawn = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    return f"<details><summary>{folded}</summary>{drawn}</details>" if folded else drawn
+    html = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f"<details><summary>{folded}</summary>{html}</details>" if folded else html
 
 
 def about(columns: Sequence[Column]) -> str:
@@ -362,18 +360,18 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     from legged_mw.eval import plots  # imports matplotlib, which takes a second
 
     folder.mkdir(parents=True, exist_ok=True)
-    asked = ExamRules.from_mapping(columns[0].exam["rules"])
+    rules = ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column.plain() for column in columns]}
     for column in columns:
         if column.strip:
             (folder / "stride.png").write_bytes(column.strip)
-    if asked.peers:
-        content |= {"peer": best_of(asked.peers), "peers": [peer._asdict() for peer in asked.peers]}
+    if rules.peers:
+        content |= {"peer": best_of(rules.peers), "peers": [peer._asdict() for peer in rules.peers]}
     _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
-    sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
+    sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], rules)
     _write_text(
         folder / "report.html",
-        walking_page(task, asked, columns, [(section, plots.svgs(section)) for section in sections]),
+        walking_page(task, rules, columns, [(section, plots.svgs(section)) for section in sections]),
     )
 
 

@@ -72,24 +72,24 @@ def roll_out(
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
     timeline = _timeline(cases, steps, [command.default for command in env.command_table])
-    asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
-    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer
-    commands.copy_(asked[0])
+    requested, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
+    commands = getattr(env, "commands", requested[0])  # a task without commands has no buffer
+    commands.copy_(requested[0])
     obs, actor = env.first_observations(), _Actor(policy, env.num_envs, alone)
-    fell_at, kept = torch.full((env.num_envs,), math.inf, device=env.device), dict[str, Tensor]()
+    fell_at, recorded = torch.full((env.num_envs,), math.inf, device=env.device), dict[str, Tensor]()
     for step in range(steps):
         sampled = {name: signal(env) for name, signal in signals.items()} | actor.believed(obs)
         for name, value in sampled.items():
-            if name not in kept:
-                kept[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
-            kept[name][step] = value
+            if name not in recorded:
+                recorded[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
+            recorded[name][step] = value
         actions = actor.act(obs)
         if step in pushes:
             worlds, jumps = pushes[step]
             env.root_lin_vel[worlds, :2] += jumps
         # set the next command before the step, because the observation at the end of the step contains it
         if step + 1 < steps:
-            commands.copy_(asked[step + 1])
+            commands.copy_(requested[step + 1])
         obs, _, dones, _ = env.step(actions)
         actor.forget(dones)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
@@ -100,7 +100,7 @@ def roll_out(
         commands=timeline,
         fell_at=fell_at.cpu().numpy(),
         last_position=env.root_pos[:, :2].cpu().numpy().copy(),
-        signals={name: values.cpu().numpy() for name, values in kept.items()},
+        signals={name: values.cpu().numpy() for name, values in recorded.items()},
     )
 
 
@@ -126,10 +126,10 @@ class _Actor:
     def believed(self, obs: TensorDict) -> dict[str, Tensor]:
         """The signal "estimate" (N, 2): estimated vx, vy [m/s]. Empty if the policy has no velocity estimator."""
         with torch.inference_mode():
-            found = [
+            estimates = [
                 value for policy, worlds in self._parts if (value := believed_velocity(policy, obs[worlds])) is not None
             ]
-        return {"estimate": torch.cat(found)} if found else {}
+        return {"estimate": torch.cat(estimates)} if estimates else {}
 
     def forget(self, ended: Tensor) -> None:
         """Reset the memory of a recurrent policy in the worlds of the mask ``ended`` (N,)."""
@@ -148,13 +148,13 @@ def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> ND
 
 def _pushes_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
     """Control step -> pushed worlds (M,) and the changes of their velocity (M, 2) [m/s], horizontal, world frame."""
-    pushed, found = [(world, case.push) for world, case in enumerate(cases) if case.push], {}
+    pushed, by_step = [(world, case.push) for world, case in enumerate(cases) if case.push], {}
     for step in {push.step for _, push in pushed}:
-        now = [(world, push) for world, push in pushed if push.step == step]
-        speeds = torch.tensor([[push.speed] for _, push in now], device=device)
-        directions = torch.tensor([[math.cos(push.angle), math.sin(push.angle)] for _, push in now], device=device)
-        found[step] = torch.tensor([world for world, _ in now], device=device), speeds * directions
-    return found
+        at_step = [(world, push) for world, push in pushed if push.step == step]
+        speeds = torch.tensor([[push.speed] for _, push in at_step], device=device)
+        directions = torch.tensor([[math.cos(push.angle), math.sin(push.angle)] for _, push in at_step], device=device)
+        by_step[step] = torch.tensor([world for world, _ in at_step], device=device), speeds * directions
+    return by_step
 
 
 # ---- the exam: nominal robot, no noise, mean actions; each world starts at rest in the default pose
@@ -254,15 +254,15 @@ def make_plan(cfg: LeggedRobotCfg, dt: float) -> Plan:
     ranges = cfg.commands.ranges
     limits = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
     axes = [np.unique(np.linspace(low, high, n).round(3)).tolist() for (low, high), n in zip(limits, GRID, strict=True)]
-    rest = [min(max(0.0, low), high) for low, high in limits]  # zero, or the nearest value in the range
+    nearest = [min(max(0.0, low), high) for low, high in limits]  # zero, or the nearest value in the range
     rules = ExamRules.from_config(cfg)
     exams, commands, held = cases(rules, dt), len(rules.commands()), len(rules.held())
     groups = {
         "commands": exams[:commands],
         "transport": exams[commands:held],  # empty if the command is one of the 22
         "pushes": exams[held:],
-        "vx_yaw": [holding((vx, rest[1], yaw)) for yaw in axes[2] for vx in axes[0]],
-        "vx_vy": [holding((vx, vy, rest[2])) for vy in axes[1] for vx in axes[0]],
+        "vx_yaw": [holding((vx, nearest[1], yaw)) for yaw in axes[2] for vx in axes[0]],
+        "vx_vy": [holding((vx, vy, nearest[2])) for vy in axes[1] for vx in axes[0]],
         **{f"step_{name}": _stepping(i, limits[i], dt) for i, name in enumerate(NAMES)},
         "standing_pushes": pushes(rules, (0.0, 0.0, 0.0), round(PUSH_AT / dt)),
     }
@@ -320,20 +320,20 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
 
 def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     """The exam's result and the report's figures, from one rollout in the environment of a prepared task."""
-    plan, asked = make_plan(env.cfg, env.dt), ExamRules.from_config(env.cfg)
-    record = roll_out(env, policy, plan.cases, round(EXAM_SECONDS / env.dt), REPORT_SIGNALS, alone=asked.worlds())
-    gathered = gather(env, asked, plan, record)
-    return grade(asked, record.part(slice(asked.worlds()))), gathered
+    plan, rules = make_plan(env.cfg, env.dt), ExamRules.from_config(env.cfg)
+    record = roll_out(env, policy, plan.cases, round(EXAM_SECONDS / env.dt), REPORT_SIGNALS, alone=rules.worlds())
+    report = gather(env, rules, plan, record)
+    return grade(rules, record.part(slice(rules.worlds()))), report
 
 
-def gather(env: LeggedRobot, asked: ExamRules, plan: Plan, record: Record) -> dict[str, Any]:
+def gather(env: LeggedRobot, rules: ExamRules, plan: Plan, record: Record) -> dict[str, Any]:
     """All figures of the report except the exam's result, as plain numbers."""
     parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
     settled, until = round(SETTLING / env.dt), round(PUSH_UNTIL / env.dt)
     held, axes, first = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
     # first index of the grid's row with vy nearest to 0
     straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])
-    ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
+    forward = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
     return {
         "joint_names": list(env.robot.joint_names),
         "foot_names": list(env.foot_names),
@@ -344,20 +344,20 @@ def gather(env: LeggedRobot, asked: ExamRules, plan: Plan, record: Record) -> di
             "vx_vy": figures.tracking_errors(parts["vx_vy"], settled, len(axes["vy"])),
         },
         "steps": {name: figures.responses(parts[f"step_{name}"], i, first) for i, name in enumerate(NAMES)},
-        "gait": figures.gaits(held, settled, asked.commands(), GAIT_SECONDS),
+        "gait": figures.gaits(held, settled, rules.commands(), GAIT_SECONDS),
         **(
-            {"estimate": figures.estimates(held, asked.commands(), ESTIMATE_SECONDS)}
+            {"estimate": figures.estimates(held, rules.commands(), ESTIMATE_SECONDS)}
             if "estimate" in held.signals
             else {}
         ),
         "joints": figures.joints(held, settled, joint_limits(env)),
         "motors": figures.envelopes(held, settled, [family(name) for name in env.robot.joint_names], motor_limits(env)),
         "pushes": {
-            "speeds": list(asked.push_speeds),
+            "speeds": list(rules.push_speeds),
             "walking": figures.survival(parts["pushes"].fell_at, until),
             "standing": figures.survival(parts["standing_pushes"].fell_at, until),
         },
-        "transport": {"vx": axes["vx"], **figures.transport(ahead, settled)},
+        "transport": {"vx": axes["vx"], **figures.transport(forward, settled)},
         "reward": figures.reward_shares(held, settled, env.reward_names),
     }
 
@@ -416,12 +416,12 @@ class TrainingExam:
         """
         dt = self.env.dt
         with keep_random_state(self.env.device):
-            asked = cases(self.rules, dt, TRAINING_PUSH_AT)
-            record = roll_out(self.env, policy, asked, round(TRAINING_SECONDS / dt), {"velocity": SIGNALS["velocity"]})
-        found = training_figures(record, len(self.rules.commands()))
-        errors = [found[name] for name in ERRORS]
-        self.advice = self.rules.advise(errors, found["falls"], found["pushes_survived"])
-        return found
+            exam = cases(self.rules, dt, TRAINING_PUSH_AT)
+            record = roll_out(self.env, policy, exam, round(TRAINING_SECONDS / dt), {"velocity": SIGNALS["velocity"]})
+        result = training_figures(record, len(self.rules.commands()))
+        errors = [result[name] for name in ERRORS]
+        self.advice = self.rules.advise(errors, result["falls"], result["pushes_survived"])
+        return result
 
 
 def training_figures(record: Record, count: int) -> dict[str, float]:
@@ -430,13 +430,13 @@ def training_figures(record: Record, count: int) -> dict[str, float]:
     The error of a world that fell is its command, as if the robot stood still.
     """
     settled, stood = round(TRAINING_SETTLING / record.dt), np.isinf(record.fell_at)
-    asked = record.commands[settled:, :count, :3]
+    commands = record.commands[settled:, :count, :3]
     velocity = record.signals["velocity"][settled:, :count]
-    missed = np.where(stood[:count, None], velocity - asked, asked)
-    believed = record.signals["estimate"][settled:, :count] if "estimate" in record.signals else velocity[..., :0]
-    rms = np.sqrt(((believed - velocity[..., : believed.shape[-1]]) ** 2).mean(axis=(0, 1)))
+    error = np.where(stood[:count, None], velocity - commands, commands)
+    estimate = record.signals["estimate"][settled:, :count] if "estimate" in record.signals else velocity[..., :0]
+    rms = np.sqrt(((estimate - velocity[..., : estimate.shape[-1]]) ** 2).mean(axis=(0, 1)))
     return {
-        **dict(zip(ERRORS, np.abs(missed).mean(axis=(0, 1)).tolist(), strict=True)),
+        **dict(zip(ERRORS, np.abs(error).mean(axis=(0, 1)).tolist(), strict=True)),
         "falls": float((~stood[:count]).sum()),
         "pushes_survived": float(stood[count:].mean()),
         **dict(zip(("estimate_vx", "estimate_vy"), rms.tolist(), strict=False)),

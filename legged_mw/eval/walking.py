@@ -55,8 +55,8 @@ class Peer(NamedTuple):
 
     def fits(self, rules: ExamRules) -> bool:
         """Whether it was measured with the commands and pushes of ``rules``."""
-        apart = ("push_vx", "transport_vx") if self.own_speed else ()
-        return all(getattr(rules, name) == value for name, value in self.asked.items() if name not in apart)
+        ignored = ("push_vx", "transport_vx") if self.own_speed else ()
+        return all(getattr(rules, name) == value for name, value in self.asked.items() if name not in ignored)
 
 
 def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, float]]:
@@ -69,23 +69,23 @@ def _read_peers() -> tuple[dict[str, list[Peer]], dict[str, Ranges], dict[str, f
     loads: dict[str, float] = {}
     # libyaml reads this file nine times as fast as load_yaml; every training reads it at its start
     text = (ROOT / "resources/peers.yaml").read_text(encoding="utf-8")
-    for robot, said in yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
-        speeds = tuple(said["push_speeds"])
+    for robot, entry in yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)).items():
+        speeds = tuple(entry["push_speeds"])
         peers[robot] = []
-        if "common" in said:
-            common[robot] = tuple((low, high) for low, high in said["common"])
-        if "load" in said:
-            loads[robot] = float(said["load"])
-        for each in said["policies"]:
-            half = round(each["trained"][0] / 2, 4)
-            asked = {"push_speeds": speeds, **{name: each.get(name, half) for name in ("push_vx", "transport_vx")}}
+        if "common" in entry:
+            common[robot] = tuple((low, high) for low, high in entry["common"])
+        if "load" in entry:
+            loads[robot] = float(entry["load"])
+        for each in entry["policies"]:
+            half_vx = round(each["trained"][0] / 2, 4)
+            asked = {"push_speeds": speeds, **{name: each.get(name, half_vx) for name in ("push_vx", "transport_vx")}}
             pushes = {f"{speed:g}": share for speed, share in zip(speeds, each["pushes"], strict=True)}
             rest = {"drift": each["drift"], "pushes": pushes, "cost_of_transport": each["cost_of_transport"]}
-            own = {"ranges": tuple((-highest, highest) for highest in each["trained"]), **asked}
-            peers[robot].append(Peer(each["name"], own, {"falls": 0, **each["own"], **rest}))
+            rules = {"ranges": tuple((-highest, highest) for highest in each["trained"]), **asked}
+            peers[robot].append(Peer(each["name"], rules, {"falls": 0, **each["own"], **rest}))
             if "common" in each:
-                alike, found = {"ranges": common[robot], **asked}, {"falls": 0, **each["common"], **rest}
-                peers[robot].append(Peer(each["name"], alike, found, own_speed=True, hard=each.get("hard")))
+                shared, figures = {"ranges": common[robot], **asked}, {"falls": 0, **each["common"], **rest}
+                peers[robot].append(Peer(each["name"], shared, figures, own_speed=True, hard=each.get("hard")))
     return peers, common, loads
 
 
@@ -162,8 +162,8 @@ class ExamRules:
         ``trained``: command -> (lowest, highest), used for commands without a range in ``given``.
         ``feet``: number of feet; a robot with two feet gets the defaults of a biped. Raises ConfigError.
         """
-        said = {name: value for name, value in given.items() if value or name not in OTHERS}
-        given = {"ranges": {}, "peer": "", **(BIPED if feet == 2 else OTHERS), **said}
+        present = {name: value for name, value in given.items() if value or name not in OTHERS}
+        given = {"ranges": {}, "peer": "", **(BIPED if feet == 2 else OTHERS), **present}
         ranges = {**(trained or {}), **given["ranges"]}
         given["peer"] = robot_of(given["peer"])
         _check(given, ranges)
@@ -171,11 +171,11 @@ class ExamRules:
         scaled = (round(max(0.06 * vx[1], 0.04), 4), 0.06, round(0.1 * yaw[1], 4) if yaw[1] > 0 else 0.12)
         marks = given.get("marks") or (scaled if given["marks_of"] == "error" else OFFSET_MARKS)
         push_vx, transport_vx = (float(given.get(name) or round(vx[1] / 2, 4)) for name in ("push_vx", "transport_vx"))
-        speeds, kept = (
+        speeds, others = (
             tuple(map(float, given["push_speeds"])),
             {name: given[name] for name in ("marks_of", "push_mark", "peer")},
         )
-        return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **kept)
+        return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **others)
 
     def to_mapping(self) -> dict[str, Any]:
         """The rules as plain values for JSON or YAML, which ``from_mapping`` reads."""
@@ -211,13 +211,13 @@ class ExamRules:
         first = self.peers[0]
         if len(self.peers) == 1:
             return f"The peer is {first.name}'s policy for this robot, graded by the same rules in MuJoCo's C engine."
-        apart = (
+        note = (
             f"* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at {self.push_vx:g} m/s: "
             "compare them with care."
         )
         return (
             f"Best of {len(self.peers)}: figure by figure the best of any published policy for this robot that was asked these ranges, "
-            f"each in its own scene, in MuJoCo's C engine; no policy has them all. {apart if first.own_speed else ''}"
+            f"each in its own scene, in MuJoCo's C engine; no policy has them all. {note if first.own_speed else ''}"
         ).strip()
 
     def commands(self) -> list[Velocity]:
@@ -260,35 +260,35 @@ class ExamRules:
             signals[name] for name in ("velocity", "position", "power", "joint_speed")
         )
         commands, held, settled = self.commands(), self.held(), round(SETTLING / dt)
-        ahead, stood = held.index((self.transport_vx, 0.0, 0.0)), np.isinf(fell_at)
+        forward, upright = held.index((self.transport_vx, 0.0, 0.0)), np.isinf(fell_at)
         distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # straight-line distance [m]
-        energy = power[settled:, ahead].sum(dtype=float) * dt
-        moved = stood[ahead] and distance[ahead] > SLOW * (len(velocity) - settled) * dt
+        energy = power[settled:, forward].sum(dtype=float) * dt
+        moved = upright[forward] and distance[forward] > SLOW * (len(velocity) - settled) * dt
         survived = (fell_at[len(held) :] > round(PUSH_UNTIL / dt)).reshape(-1, PUSH_DIRECTIONS).mean(axis=1)
         result = {
-            **_tracking(velocity[settled:, : len(commands)], commands, stood[: len(commands)]),
-            "drift": float(distance[0]) if stood[0] else None,
-            "joint_speed": float(joint_speed[-round(1.0 / dt) :, 0].mean()) if stood[0] else None,
+            **_tracking(velocity[settled:, : len(commands)], commands, upright[: len(commands)]),
+            "drift": float(distance[0]) if upright[0] else None,
+            "joint_speed": float(joint_speed[-round(1.0 / dt) :, 0].mean()) if upright[0] else None,
             "pushes": {
                 f"{speed:g}": round(float(share), 4) for speed, share in zip(self.push_speeds, survived, strict=True)
             },
-            "cost_of_transport": float(energy / (mass * GRAVITY * distance[ahead])) if moved else None,
+            "cost_of_transport": float(energy / (mass * GRAVITY * distance[forward])) if moved else None,
             "rules": self.to_mapping(),
         }
         if "estimate" in signals:
-            missed = (signals["estimate"] - velocity[..., :2])[settled:, : len(commands)][:, stood[: len(commands)]]
+            error = (signals["estimate"] - velocity[..., :2])[settled:, : len(commands)][:, upright[: len(commands)]]
             result["estimate_rms"] = (
-                _plain(np.sqrt((missed.astype(float) ** 2).mean(axis=(0, 1)))) if missed.size else None
+                _plain(np.sqrt((error.astype(float) ** 2).mean(axis=(0, 1)))) if error.size else None
             )
-        beats = {"beats_peer": self.beats_peer(result)} if self.peers else {}
-        return {"walks": self.walks(result), **beats, **result}
+        peer = {"beats_peer": self.beats_peer(result)} if self.peers else {}
+        return {"walks": self.walks(result), **peer, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
         """Whether the policy walks: no falls, errors or offsets within the marks, all pushes of ``push_mark`` survived."""
         if result["falls"]:
             return False
-        small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
-        return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
+        within = all(value <= mark for value, mark in zip(result[self.marks_of], self.marks, strict=True))
+        return within and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
     def advise(self, errors: Sequence[float], falls: float, survived: float) -> list[str]:
         """Three lines from the exam during training: what the policy can do, what it cannot do, what to try next.
@@ -296,21 +296,21 @@ class ExamRules:
         ``errors`` of vx, vy [m/s] and yaw rate [rad/s] contain the sway. So their limit is twice the mark if the marks
         limit the offset. ``falls``: of 22 commands; ``survived``: share of the pushes (0 to 1).
         """
-        most = [mark * (2.0 if self.marks_of == "offset" else 1.0) for mark in self.marks]
+        limits = [mark * (2.0 if self.marks_of == "offset" else 1.0) for mark in self.marks]
         able = {"stand at all 22 commands": not falls, f"survive pushes of {self.push_mark:g} m/s": survived == 1.0}
-        for (axis, unit), error, limit in zip(AXES, errors, most, strict=True):
+        for (axis, unit), error, limit in zip(AXES, errors, limits, strict=True):
             able[f"follow {axis} ({error:.2f} {unit} off; {limit:.2g} are allowed)"] = error <= limit
-        can, cannot = ([what for what, is_able in able.items() if is_able is asked] for asked in (True, False))
+        can, cannot = ([text for text, value in able.items() if value is wanted] for wanted in (True, False))
         if not cannot:
-            after = "play.py --eval, the whole exam and the hard one"
+            advice = "play.py --eval, the whole exam and the hard one"
         elif falls:
-            after = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
+            advice = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
         else:
-            after = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
+            advice = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
         return [
             f"it can: {'; '.join(can) or 'nothing yet'}",
             f"it cannot: {'; '.join(cannot) or '-'}",
-            f"next: {after}",
+            f"next: {advice}",
         ]
 
     def beats_peer(self, result: Mapping[str, Any]) -> bool:
@@ -324,9 +324,9 @@ class ExamRules:
 
     def figures(self, result: Mapping[str, Any], others: Sequence[Mapping[str, Any]] = ()) -> list[Figure]:
         """The figures of the result in the table's order, including those that only ``others`` have."""
-        peer, unknown_of_peer = best_of(self.peers), (None, None, None)
-        apart = "*" if any(peer.own_speed for peer in self.peers) else ""
-        listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
+        peer, no_values = best_of(self.peers), (None, None, None)
+        star = "*" if any(peer.own_speed for peer in self.peers) else ""
+        found = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
         for i, (axis, unit) in enumerate(AXES):
             card = (f"{axis.removesuffix(' rate')} {self.marks_of}", unit)
             for measure, name in {
@@ -334,18 +334,18 @@ class ExamRules:
                 "worst": "  worst command",
                 "offset": "  of the mean velocity",
             }.items():
-                mark, shown_first = (self.marks[i], card) if measure == self.marks_of else (None, None)
-                beside = peer.get(measure, unknown_of_peer)[i]
-                if measure != "offset" or measure == self.marks_of or beside is not None:
-                    listed.append(Figure(name, result[measure][i], 3, mark, beside, card=shown_first))
+                mark, on_card = (self.marks[i], card) if measure == self.marks_of else (None, None)
+                peer_value = peer.get(measure, no_values)[i]
+                if measure != "offset" or measure == self.marks_of or peer_value is not None:
+                    found.append(Figure(name, result[measure][i], 3, mark, peer_value, card=on_card))
         if any("estimate_rms" in each for each in (result, *others)):
             rms = result.get("estimate_rms") or (None, None)
-            listed += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
-        listed.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
-        listed.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
+            found += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
+        found.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
+        found.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
         for speed, share in result["pushes"].items():
             mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
-            listed.append(
+            found.append(
                 Figure(
                     f"survives pushes of {speed} m/s",
                     share,
@@ -354,29 +354,29 @@ class ExamRules:
                     peer.get("pushes", {}).get(speed),
                     True,
                     card=card,
-                    peer_mark=apart,
+                    peer_mark=star,
                 )
             )
-        name, ahead = "cost_of_transport", f"at {self.transport_vx:g} m/s"
-        card = ("cost of transport", ahead)
+        name, speed_text = "cost_of_transport", f"at {self.transport_vx:g} m/s"
+        card = ("cost of transport", speed_text)
         return [
-            *listed,
-            Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=apart),
+            *found,
+            Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=star),
         ]
 
 
-def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
+def _tracking(velocity: NDArray[Any], commands: list[Velocity], upright: NDArray[Any]) -> dict[str, Any]:
     """The tracking errors of C commands, from the velocities (T, C, 3) and the worlds that did not fall (C,).
 
     The error of a world that fell is its command, so that a fall at a hard command does not improve the mean.
     """
-    asked = np.array(commands)
-    difference = velocity - asked
-    error = np.where(stood[:, None], abs(difference).mean(axis=0), abs(asked))
-    offset = np.where(stood[:, None], abs(difference.mean(axis=0)), abs(asked))
-    rows = zip(commands, error, offset, stood.tolist(), strict=True)
+    commanded = np.array(commands)
+    difference = velocity - commanded
+    error = np.where(upright[:, None], abs(difference).mean(axis=0), abs(commanded))
+    offset = np.where(upright[:, None], abs(difference.mean(axis=0)), abs(commanded))
+    rows = zip(commands, error, offset, upright.tolist(), strict=True)
     return {
-        "falls": int((~stood).sum()),
+        "falls": int((~upright).sum()),
         "error": _plain(error.mean(axis=0)),
         "worst": _plain(error.max(axis=0)),
         "offset": _plain(offset.mean(axis=0)),
@@ -394,11 +394,11 @@ def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
     better = (
         better and result["cost_of_transport"] is not None and result["cost_of_transport"] < peer["cost_of_transport"]
     )
-    beside = [
+    pairs = [
         (a, b) for name in ("worst", "offset") if name in peer for a, b in zip(result[name], peer[name], strict=True)
     ]
     pushes = all(result["pushes"][speed] >= share for speed, share in peer["pushes"].items())
-    return better and all(a <= b for a, b in beside) and pushes and result["drift"] <= max(EQUAL_DRIFT, peer["drift"])
+    return better and all(a <= b for a, b in pairs) and pushes and result["drift"] <= max(EQUAL_DRIFT, peer["drift"])
 
 
 def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> None:

@@ -146,21 +146,21 @@ def main() -> None:
         halve(Halving(args, cells, common), args, stop)
         return
     check(cells, common)
-    with TemporaryDirectory() as place:
+    with TemporaryDirectory() as temp:
         trainings = []
         for i, cell in enumerate(cells):
-            named = ["--run_name", cell.label] if cell.label else []
-            trainings.append(Training(cell.name or "as it is", [*common, *cell.flags, *named], Path(place, f"{i}.txt")))
+            extra = ["--run_name", cell.label] if cell.label else []
+            trainings.append(Training(cell.name or "as it is", [*common, *cell.flags, *extra], Path(temp, f"{i}.txt")))
         if args.print:
             print("\n".join(f"{command('train')} {shlex.join(training.flags)}" for training in trainings))
             return
         print(f"{len(cells)} trainings of {args.task}: {'; '.join(each.name for each in trainings)}", flush=True)
         stop.listen()
-        ended = train_all(trainings, args.jobs, stop)
-    found = [(cells[i], find_runs([log.folder])[0]) for i, log in sorted(ended.items())]
-    if found:
-        print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}")
-    if len(found) < len(cells):
+        logs = train_all(trainings, args.jobs, stop)
+    finished = [(cells[i], find_runs([log.folder])[0]) for i, log in sorted(logs.items())]
+    if finished:
+        print(f"\n{table(finished)}\n\n{curves_of([run for _, run in finished])}")
+    if len(finished) < len(cells):
         raise SystemExit(1)
 
 
@@ -210,15 +210,15 @@ def train_all(trainings: Sequence[Training], at_once: int, stop: Stop) -> dict[i
 
     A training that a signal stopped also stops the sweep.
     """
-    ended: dict[int, Printed] = {}
+    logs: dict[int, Printed] = {}
     for done, (i, code) in enumerate(run(trainings, at_once, stop), 1):
         log = read_printed(trainings[i].log)
         saved = bool(log.folder) and code in (0, STOPPED)
         print(f"{done}/{len(trainings)} {trainings[i].name}: {log.folder if saved else log.last}", flush=True)
         if saved:
-            ended[i] = log
+            logs[i] = log
         stop.asked |= code == STOPPED
-    return ended
+    return logs
 
 
 def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tuple[int, int]]:
@@ -229,16 +229,16 @@ def run(trainings: Sequence[Training], at_once: int, stop: Stop) -> Iterator[tup
     signal to a whole group. Each has its own cores, because trainings on the same cores are many times slower
     (rl/runner.py, UpdateThreads).
     """
-    waiting, running, told = list(enumerate(trainings)), dict[int, subprocess.Popen[bytes]](), False
-    shares, uses = shares_of(cores(), at_once), dict[int, int]()
+    waiting, running, signalled = list(enumerate(trainings)), dict[int, subprocess.Popen[bytes]](), False
+    shares, slots = shares_of(cores(), at_once), dict[int, int]()
     try:
         while running or (waiting and not stop.asked):
             while waiting and len(running) < at_once and not stop.asked:
                 i, training = waiting.pop(0)
-                uses[i] = min({*range(at_once)} - {uses[other] for other in running})
-                running[i] = _start(training, shares[uses[i]])
-            if stop.asked and not told:
-                told = True
+                slots[i] = min({*range(at_once)} - {slots[other] for other in running})
+                running[i] = _start(training, shares[slots[i]])
+            if stop.asked and not signalled:
+                signalled = True
                 for process in running.values():
                     process.terminate()
             time.sleep(_POLL)
@@ -334,30 +334,30 @@ class Halving:
 
     def __init__(self, args: argparse.Namespace, cells: Sequence[Cell], common: list[str]) -> None:
         """Raises UserError if --halve is not possible or ``folder`` holds another sweep."""
-        asked, self.task = check(cells, common)
+        train_args, self.task = check(cells, common)
         if len({cell.setting for cell in cells}) < 2:
             raise UserError("--halve chooses between settings, and there is one: give several values, --set PATH=V,V,V")
-        if not asked.max_time:
+        if not train_args.max_time:
             raise UserError("--halve needs the time of the first round: --max_time 60s")
         if not self.task.exam or self.task.train.runner.exam_interval <= 0:
-            why = (
+            reason = (
                 f"task '{self.task.name}' has none" if not self.task.exam else "runner.exam_interval = 0 leaves it out"
             )
-            raise UserError(f"--halve ranks by the exam at the end of a training, and {why}")
-        self.cells, self.seconds = {cell.label: cell for cell in cells}.values(), asked.max_time
-        name = check_name(asked.experiment_name or f"{self.task.name}_halving", "--experiment_name")
+            raise UserError(f"--halve ranks by the exam at the end of a training, and {reason}")
+        self.cells, self.seconds = {cell.label: cell for cell in cells}.values(), train_args.max_time
+        name = check_name(train_args.experiment_name or f"{self.task.name}_halving", "--experiment_name")
         self.folder = Path.cwd() / "logs" / name
         self.common = [*NO_END, *common, "--experiment_name", name]
         settings = [text for item in args.set for text in ("--set", item)]
         self._claim(shlex.join([*common, *settings, "--seeds", args.seeds]))
 
     def _claim(self, sweep: str) -> None:
-        note = self.folder / "sweep.txt"
-        before = note.read_text(encoding="utf-8") if note.is_file() else sweep
-        if before != sweep:
-            raise UserError(f"{shown(self.folder)} holds another sweep, {before}; name yours with --experiment_name")
+        file = self.folder / "sweep.txt"
+        stored = file.read_text(encoding="utf-8") if file.is_file() else sweep
+        if stored != sweep:
+            raise UserError(f"{shown(self.folder)} holds another sweep, {stored}; name yours with --experiment_name")
         self.folder.mkdir(parents=True, exist_ok=True)
-        note.write_text(sweep, encoding="utf-8")
+        file.write_text(sweep, encoding="utf-8")
 
     def file(self, cell: Cell, number: int) -> Path:
         return self.folder / f"round_{number}_{cell.label}.txt"
@@ -367,11 +367,11 @@ class Halving:
 
     def training(self, cell: Cell, number: int) -> Training:
         """The training of round ``number``. Round 1 starts a new run. A stopped run gets its remaining time."""
-        begun, before = self.log(cell, number), self.log(cell, number - 1)
-        run = begun.folder if begun.left else before.folder
-        words = ["--max_time", begun.left or f"{self.seconds * THIRD ** (number - 1):g}s"]
-        words += ["--resume", "--load_run", run] if run else ["--run_name", cell.label]
-        return Training(cell.name, [*self.common, *cell.flags, *words], self.file(cell, number))
+        current, previous = self.log(cell, number), self.log(cell, number - 1)
+        run = current.folder if current.left else previous.folder
+        more = ["--max_time", current.left or f"{self.seconds * THIRD ** (number - 1):g}s"]
+        more += ["--resume", "--load_run", run] if run else ["--run_name", cell.label]
+        return Training(cell.name, [*self.common, *cell.flags, *more], self.file(cell, number))
 
     def line(self, cell: Cell, number: int) -> str:
         """A shell command of ``training``. It writes a failure to the log file, and then it is not printed again."""
@@ -387,9 +387,9 @@ class Halving:
         """The log of the last completed round."""
         return self.log(cell, self.rounds(cell))
 
-    def found(self, places: Sequence[str]) -> list[tuple[Cell, Run]]:
+    def found(self, ranking: Sequence[str]) -> list[tuple[Cell, Run]]:
         """The runs with a completed round and their number of rounds, in the order of ``places``: best setting first."""
-        cells = sorted(self.cells, key=lambda cell: places.index(cell.setting))
+        cells = sorted(self.cells, key=lambda cell: ranking.index(cell.setting))
         return [
             (cell._replace(varied={**cell.varied, "rounds": str(self.rounds(cell))}), find_runs([log.folder])[0])
             for cell in cells
@@ -399,13 +399,13 @@ class Halving:
 
 def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
     """Train all rounds. Rounds that an earlier call or a cluster has completed are not trained again."""
-    places, failed = list(dict.fromkeys(cell.setting for cell in halving.cells)), False
-    left, better = places, ranked_figures(halving.task.exam)
+    ranking, failed = list(dict.fromkeys(cell.setting for cell in halving.cells)), False
+    left, better = ranking, ranked_figures(halving.task.exam)
     out = sys.stderr if args.print else sys.stdout  # with --print, stdout has only shell commands
     stop.listen()
     for number in count(1):
-        able = [cell for cell in halving.cells if cell.setting in left and halving.rounds(cell) >= number - 1]
-        todo = [cell for cell in able if halving.rounds(cell) < number]
+        ready = [cell for cell in halving.cells if cell.setting in left and halving.rounds(cell) >= number - 1]
+        todo = [cell for cell in ready if halving.rounds(cell) < number]
         if args.print and (
             lines := [halving.line(cell, number) for cell in todo if not halving.log(cell, number).failed]
         ):
@@ -417,27 +417,27 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
             train_all([halving.training(cell, number) for cell in todo], args.jobs, stop)
         if stop.asked:
             break
-        exams = {name: [halving.log(cell, number).exam for cell in able if cell.setting == name] for name in left}
-        failed |= any(halving.rounds(cell) < number for cell in able)
+        exams = {name: [halving.log(cell, number).exam for cell in ready if cell.setting == name] for name in left}
+        failed |= any(halving.rounds(cell) < number for cell in ready)
         if not any(exam for each in exams.values() for exam in each):
             raise UserError(f"round {number}: no training has an exam; what they said is in {shown(halving.folder)}")
         ranked = rank(exams, better)
-        places = [*ranked, *(name for name in places if name not in ranked)]
+        ranking = [*ranked, *(name for name in ranking if name not in ranked)]
         if len(left) == 1 or number == args.rounds:
             break
         left = ranked[: math.ceil(len(ranked) / THIRD)]
-    if found := halving.found(places):
-        print(f"\n{table(found)}\n\n{curves_of([run for _, run in found])}", file=out)
+    if finished := halving.found(ranking):
+        print(f"\n{table(finished)}\n\n{curves_of([run for _, run in finished])}", file=out)
     if stop.asked:
         print(f"stopped in round {number}; go on with\n  {command('sweep')} {shlex.join(sys.argv[1:])}")
         raise SystemExit(STOPPED)
     runs = {
         log.folder: [log.exam]
         for cell in halving.cells
-        if cell.setting == places[0] and (log := halving.last(cell)).done
+        if cell.setting == ranking[0] and (log := halving.last(cell)).done
     }
-    watch = shlex.join(["--task", args.task, "--load_run", rank(runs, better)[0]])
-    print(f"best: {places[0]}; watch it with\n  {command('play')} {watch}", file=out)
+    play_flags = shlex.join(["--task", args.task, "--load_run", rank(runs, better)[0]])
+    print(f"best: {ranking[0]}; watch it with\n  {command('play')} {play_flags}", file=out)
     if failed:
         print(f"some failed: what they said is in {shown(halving.folder)}; without --print they train again", file=out)
         raise SystemExit(1)
@@ -457,34 +457,34 @@ def rank(exams: Mapping[str, Sequence[Mapping[str, float]]], better: Mapping[str
 
     ``exams``: name -> figures of each of its trainings, empty without an exam. Each figure is averaged over them.
     """
-    most = max(len(each) for each in exams.values())
-    worth: dict[str, list[float]] = {}  # name -> score per figure: more is better, -inf if unknown
+    largest = max(len(each) for each in exams.values())
+    scores: dict[str, list[float]] = {}  # name -> score per figure: more is better, -inf if unknown
     for name, each in exams.items():
         means = [
             mean(exam.get(figure, math.nan) for exam in each if exam) if any(each) else math.nan for figure in better
         ]
         signed = [value if more else -value for value, more in zip(means, better.values(), strict=True)]
-        worth[name] = [-math.inf if math.isnan(value) else value for value in signed]
+        scores[name] = [-math.inf if math.isnan(value) else value for value in signed]
 
-    def order(name: str) -> tuple[int, float]:
+    def sort_key(name: str) -> tuple[int, float]:
         ahead = [
-            sum((their > own) + 0.5 * (their == own) for their in column)
-            for own, column in zip(worth[name], zip(*worth.values(), strict=True), strict=True)
+            sum((other > own) + 0.5 * (other == own) for other in column)
+            for own, column in zip(scores[name], zip(*scores.values(), strict=True), strict=True)
         ]
-        return most - sum(map(bool, exams[name])), mean(ahead)
+        return largest - sum(map(bool, exams[name])), mean(ahead)
 
-    return sorted(exams, key=order)
+    return sorted(exams, key=sort_key)
 
 
 # ---- the table
 
 
-def table(found: Sequence[tuple[Cell, Run]]) -> str:
+def table(finished: Sequence[tuple[Cell, Run]]) -> str:
     """One line per run. Several seeds add the mean and standard deviation of each setting."""
-    fields = list(dict.fromkeys(path for cell, _ in found for path in cell.varied))
-    (_, *heads), *lines = rows(runs := [run for _, run in found])
-    short = [path.rpartition(".")[2] for path in fields]
-    settings = [{path: cell.varied.get(path, "") for path in fields} for cell, _ in found]
+    fields = list(dict.fromkeys(path for cell, _ in finished for path in cell.varied))
+    (_, *heads), *lines = rows(runs := [run for _, run in finished])
+    names = [path.rpartition(".")[2] for path in fields]
+    settings = [{path: cell.varied.get(path, "") for path in fields} for cell, _ in finished]
     cells = [[*setting.values(), *line] for setting, (_, *line) in zip(settings, lines, strict=True)]
     means = []
     if "seed" in fields:
@@ -492,11 +492,11 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
         for i, setting in enumerate(settings):
             groups.setdefault(tuple({**setting, "seed": ""}.values()), []).append(i)
         columns = figures(runs).values()
-        for of in groups.values():
-            if len(of) > 1:
-                figured = [_mean(digits, [values[i] for i in of]) for digits, values in columns]
-                means.append([*{**settings[of[0]], "seed": f"mean of {len(of)}"}.values(), *figured])
-    return text_table([[*short, *heads], *cells, *means])
+        for members in groups.values():
+            if len(members) > 1:
+                summary = [_mean(digits, [values[i] for i in members]) for digits, values in columns]
+                means.append([*{**settings[members[0]], "seed": f"mean of {len(members)}"}.values(), *summary])
+    return text_table([[*names, *heads], *cells, *means])
 
 
 def _mean(digits: str, values: Sequence[float | None]) -> str:
@@ -509,5 +509,5 @@ def _mean(digits: str, values: Sequence[float | None]) -> str:
         return "-"
     spread = stdev(numbers)
     needed = 1 - math.floor(math.log10(spread)) if spread > 0 else 0
-    places = max(int(digits.strip(",.df") or 0), min(needed, 6))
-    return f"{mean(numbers):.{places}f} ± {spread:.{places}f}"
+    decimals = max(int(digits.strip(",.df") or 0), min(needed, 6))
+    return f"{mean(numbers):.{decimals}f} ± {spread:.{decimals}f}"
