@@ -1,6 +1,6 @@
-"""The exams of an export, in MuJoCo's C engine. ``legged_mw.eval.walking`` has the walking exam, ``skills`` the others.
+"""Run the exams of an export in MuJoCo's C engine. ``legged_mw.eval.walking`` and ``skills`` define the exams.
 
-A step is in the order of the environment's exams, so both give one result: sample, decide, push, move, check falls.
+A step has the order of the environment's exams, so both give equal results: sample, policy, push, physics, falls.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from legged_mw.utils.errors import UserError, unknown
 
 
 def run(folder: Path, exam: ExamRules | Skill, hard: bool = True) -> tuple[dict[str, Any], bytes]:
-    """Grade the export in ``folder`` by the rules ``exam``, with ``hard`` also its heat and power.
+    """Grade the export in ``folder`` by the rules ``exam``. Returns the result and a PNG of one stride, or b"".
 
-    Of a walk then the hard exam too, and a PNG of one stride.
+    ``hard`` adds heat and power. For a walking policy it also adds the hard exam and the PNG.
     """
     heat: dict[str, Any] = {"heat": run_heat(folder, exam)} if hard else {}
     if isinstance(exam, Skill):
@@ -52,10 +52,10 @@ def run_exam(
     scene: str | Path = SCENE_FILE,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Grade the export in ``folder`` by the rules ``exam``, else by its contract. Raises ContractError, ConfigError.
+    """Grade the export in ``folder`` by ``exam``, or by its contract's rules. Raises ContractError, ConfigError.
 
-    ``common``: the contract's rules, but with the command range shared by all published policies of the robot.
-    ``contact``, ``edited`` and ``scene``, its ``scene_file``: see DeployStage. ``seed``: of the start, see ``scatter``.
+    ``common``: use the contract's rules with the common command range of the robot's published policies.
+    ``contact``, ``edited``, ``scene`` (``scene_file``): see DeployStage. ``seed``: of the start, see ``scatter``.
     """
     contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
@@ -74,9 +74,9 @@ def run_exam(
         sampled["position"].append(stage.qpos()[:, :2])
         sampled["power"].append(np.abs(stage.measured.joint_torque * stage.measured.joint_vel).sum(axis=1))
         sampled["joint_speed"].append(np.abs(stage.measured.joint_vel).mean(axis=1))
-        _push(stage, exam, step)  # the policy decides on a measurement before the push
+        _push(stage, exam, step)  # the policy acts on the measurement from before the push
         stage.step(wanted)
-        estimate = stage.believed_velocity()  # from the same measurement
+        estimate = stage.believed_velocity()  # of the same measurement
         sampled["estimate"] += [] if estimate is None else [estimate]
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     signals = {name: np.stack(values) for name, values in sampled.items() if values}
@@ -88,7 +88,7 @@ def run_exam(
 def run_skill(
     folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False, seed: int = 0
 ) -> dict[str, Any]:
-    """Grade the export in ``folder`` by ``skill``, else by the skill in its contract.
+    """Grade the export in ``folder`` by ``skill``, or by the skill exam of its contract.
 
     ``edited``: see DeployStage. ``seed``: of the start, see ``scatter``.
     """
@@ -100,7 +100,7 @@ def run_skill(
 
 
 def contract_skill(contract: Contract) -> Skill:
-    """The skill exam named by the key ``kind`` in the contract's section ``exam``."""
+    """The skill exam of the contract's section ``exam``. Raises ContractError."""
     section = dict(contract.exam or {})
     try:
         return make_skill(str(section.pop("kind", "")), section)
@@ -111,7 +111,7 @@ def contract_skill(contract: Contract) -> Skill:
 def perform(
     folder: Path, skill: Skill, ground: ExamGround, threads: int = 0, edited: bool = False, seed: int = 0
 ) -> tuple[ExamRobot, Recording]:
-    """Put robots into their starts on ``ground`` and run the policy."""
+    """Put the robots in their start states on ``ground`` and run the policy."""
     stage = DeployStage(
         folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited
     )
@@ -135,7 +135,7 @@ def perform(
 
 
 def put_on(model: mujoco.MjModel, ground: ExamGround) -> None:
-    """Edit a scene: slope (by leaning gravity), friction of the ground, mass of the root (inertia in proportion)."""
+    """Edit a scene: slope (by tilting gravity), ground friction, mass of the root (its inertia scales with it)."""
     if ground.slope:
         size, angle = np.linalg.norm(model.opt.gravity), math.radians(ground.slope)
         model.opt.gravity[:] = size * math.sin(angle), 0.0, -size * math.cos(angle)
@@ -149,7 +149,7 @@ def put_on(model: mujoco.MjModel, ground: ExamGround) -> None:
 
 
 def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
-    """The walking exam of an export: its contract's section ``exam``, the trained ranges and the number of feet."""
+    """The rules from a contract's section ``exam``, trained ranges and number of feet. Raises ContractError."""
     trained = {command.name: (command.low, command.high) for command in contract.commands}
     if missing := [name for name in VELOCITY if name not in trained]:
         raise ContractError(
@@ -168,7 +168,7 @@ def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
 
 
 def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
-    """At step k of the pushes, add each push speed in direction k to the base's horizontal velocity, world frame."""
+    """In step k after the first push, push one robot at each push speed in direction k, world frame."""
     k = step - round(walking.PUSH_AT / stage.dt)
     if 0 <= k < walking.PUSH_DIRECTIONS:
         angle = 2 * math.pi * k / walking.PUSH_DIRECTIONS
@@ -177,34 +177,34 @@ def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
             stage.push(world, [speed * math.cos(angle), speed * math.sin(angle)])
 
 
-# ---- two policies on one robot: the first until it falls, the second until it stands --------------------------------
+# ---- two policies on one robot: after a fall the second runs until the robot stands ---------------------------------
 
 
-# [deg] tilt of the robot's z axis at which the second policy takes over [ours: a walker does not recover from it]
+# [deg] tilt of the robot's z axis above which the second policy starts [ours: a walking policy does not recover from it]
 FELL = 60.0
-# The robot stands again, and the first policy takes over, when all three hold [ours]:
-# [deg] tilt; [rad] mean distance of joints from the first's default pose; [rad/s] mean joint speed
+# The robot stands, and the first policy starts, if all three values are below these limits for HOLD [ours]:
+# [deg] tilt; [rad] mean distance of the joints from the first policy's default pose; [rad/s] mean joint speed
 UP, NEAR, SLOW = 10.0, 0.3, 1.0
-HOLD = 0.5  # [s] that they must hold
+HOLD = 0.5  # [s]
 
 
 class SwitchStage(DeployStage):
     """Robots with the policy in ``first``. After a fall the policy in ``second`` runs until the robot stands.
 
-    Only robots that MuJoCo cannot step are reset.
+    A fall resets no robot; a robot that MuJoCo cannot step is reset.
     """
 
     def __init__(
         self, first: Path, second: Path, num_worlds: int = 1, command: Any = None, edited: bool = False
     ) -> None:
-        """``edited``: see read_contract. Raises UserError for policies of two robots, ContractError for broken ones."""
-        # the body touches the ground
+        """``edited``: see read_contract. Raises UserError if the policies' robots differ, ContractError."""
+        # ``whole``: the whole body collides with the ground
         super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True, edited=edited)
         other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
         self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) True while the second policy runs
-        self._standing = np.zeros(num_worlds, dtype=int)  # (N,) periods that the robot has stood
+        self._standing = np.zeros(num_worlds, dtype=int)  # (N,) control periods since the robot stands
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
 
     def step(self, commands: Floats | None = None) -> None:
@@ -216,19 +216,19 @@ class SwitchStage(DeployStage):
         self.fleet.write(np.where(rescued, targets[1], targets[0]))
         self.measured = self.fleet.read()
         broken = self.fleet.broken | ~np.isfinite(self.fleet.qvel).all(axis=1)
-        for world in np.flatnonzero(broken):  # such a state cannot stand up
+        for world in np.flatnonzero(broken):  # no policy can act on such a state
             self.reset(int(world))
         tilted = self.contract.ends.tilted(self.measured.gravity)
         self._fell, stood = tilted & ~self.rescued, self._stood(self.measured)
         back = self.rescued & stood
         self.rescued = (self.rescued | self._fell) & ~back
-        # the policy that does not run keeps no memory, so it starts fresh
+        # reset the memory of the policy that does not run
         self.controller.reset(self.rescued | back)
         self.rescuer.reset(~self.rescued | self._fell)
         self._fell |= broken
 
     def _stood(self, measured: Measurement) -> np.ndarray:
-        """(N,) True if upright, near the first policy's default pose and slow, for HOLD."""
+        """(N,) True if the robot was upright, near the first policy's default pose and slow for HOLD."""
         upright = ~Ends(max_tilt=UP).tilted(measured.gravity)
         near = np.abs(measured.joint_pos - self.contract.default_pose).mean(axis=1) < NEAR
         slow = np.abs(measured.joint_vel).mean(axis=1) < SLOW
@@ -236,14 +236,14 @@ class SwitchStage(DeployStage):
         return self._standing >= round(HOLD / self.dt)
 
     def reset(self, world: int) -> None:
-        """Put the robot back to the start, with the first policy."""
+        """Reset the robot to its start state, with the first policy."""
         super().reset(world)
         self.rescuer.reset([world])
         self.rescued[world], self._standing[world] = False, 0
 
 
 def check_same(first: Contract, second: Contract) -> None:
-    """Raise UserError if two policies cannot take turns on one robot."""
+    """Raise UserError if two policies cannot control the same robot."""
     own = sorted({row.name for row in second.rows if row.measured in OWN} - {row.name for row in first.rows})
     for what, here, there in (
         ("joints", first.joints, second.joints),

@@ -1,4 +1,4 @@
-"""Run the hard exam of ``legged_mw.eval.hard`` on an export: all conditions side by side, then one robot to look at."""
+"""Run the hard exam of ``legged_mw.eval.hard`` on an export: all conditions in parallel, then the gait of one robot."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from legged_mw.eval.hard import CONDITIONS, NOISE, Walk
 from legged_mw.eval.walking import GRAVITY, ExamRules
 from legged_mw.utils.commands import VELOCITY
 
-LOOK_SECONDS = 10.0  # [s] that one robot is looked at, the settling time included
-PICTURES, WIDTH, HEIGHT = 6, 240, 260  # of a strip, over one stride; [px] of each
-SEED = 1  # of the noise
+LOOK_SECONDS = 10.0  # [s] duration of the gait measurement, with the settling time
+PICTURES, WIDTH, HEIGHT = 6, 240, 260  # pictures of one stride; [px] size of each
+SEED = 1  # seed of the noise
 
 
 def run_hard(
     folder: Path, rules: ExamRules, walks: bool, edited: bool = False, scene: str | Path = SCENE_FILE, seed: int = 0
 ) -> tuple[dict[str, Any], list[Floats]]:
-    """The hard exam's result, and qpos (nq,) of the robot at PICTURES moments of a stride; none if it fell.
+    """The hard exam's result, and qpos (nq,) at PICTURES times of a stride; no qpos if the robot fell.
 
-    ``walks``: by the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. ``seed``: of the noise, and of
-    the start (see ``scatter``). Raises ContractError, UserError.
+    ``walks``: the verdict of the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. ``seed``: of the
+    noise and of the start (see ``scatter``). Raises ContractError, UserError.
     """
     contract = read_contract(folder, edited)
     load = hard.load_of(rules, contract.mass)
@@ -56,7 +56,7 @@ def run_conditions(
     scene: str | Path = SCENE_FILE,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Condition -> falls, errors, drift and pushes; each condition has its own range of worlds."""
+    """Condition -> falls, errors, drift and pushes. Each condition has its own worlds."""
     asked = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
     count = len(asked) * len(CONDITIONS)
     wanted = commands_of(contract, asked * len(CONDITIONS))
@@ -79,7 +79,7 @@ def run_conditions(
 
 
 def commands_of(contract: Contract, velocities: Sequence[Sequence[float]]) -> Floats:
-    """Commands (N, C) with these vx, vy, yaw rates (N, 3) and the defaults of all others."""
+    """Commands (N, C): ``velocities`` (N, 3) are vx, vy, yaw rate; other commands have their defaults."""
     names = [command.name for command in contract.commands]
     wanted = np.tile([command.default for command in contract.commands], (len(velocities), 1))
     wanted[:, [names.index(name) for name in VELOCITY]] = velocities
@@ -87,7 +87,7 @@ def commands_of(contract: Contract, velocities: Sequence[Sequence[float]]) -> Fl
 
 
 def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float, seed: int = 0) -> None:
-    """Give world i the condition ``CONDITIONS[which[i]]``; ``load`` [kg] is added to the heaviest body."""
+    """Apply condition ``CONDITIONS[which[i]]`` to world i. ``load`` [kg] is added to the heaviest body."""
     fleet = stage.fleet
     fleet.set_delay(np.array([each.delay / 1000.0 for each in CONDITIONS])[which])
     fleet.scale_gains(np.array([each.gains for each in CONDITIONS])[which])
@@ -113,7 +113,7 @@ def trunk_of(model: mujoco.MjModel) -> int:
 
 
 def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
-    """At step k of the pushes, push one robot of each condition in direction k."""
+    """In step k after the first push, push one robot of each condition in direction k."""
     k = step - round(hard.PUSH_AT / stage.dt)
     if not 0 <= k < hard.PUSH_DIRECTIONS:
         return
@@ -123,7 +123,7 @@ def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
         stage.push(world, [speed * math.cos(angle), speed * math.sin(angle)])
 
 
-# ---- one robot that is looked at ------------------------------------------------------------------------------------
+# ---- the gait of one robot ------------------------------------------------------------------------------------------
 
 
 def look(
@@ -134,7 +134,7 @@ def look(
     scene: str | Path = SCENE_FILE,
     seed: int = 0,
 ) -> tuple[Walk | None, list[Floats]]:
-    """A walk straight ahead at half of the highest vx, and poses of one stride; None if the robot falls."""
+    """Record a walk ahead at half of the highest vx, and the qpos of one stride. None if the robot falls."""
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
     witness: list[Witness] = []
     stage = DeployStage(
@@ -147,7 +147,7 @@ def look(
         edited=edited,
         each=lambda: witness[0].sample(),
     )
-    witness.append(Witness(stage.fleet))  # feet stand level in the pose of the scene
+    witness.append(Witness(stage.fleet))  # before scatter, because the feet must be level
     stage.scatter(seed)
     wanted = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
     targets, poses, settled = [], [], round(hard.SETTLING / stage.dt)
@@ -167,15 +167,15 @@ def look(
 
 
 def _solve_well(model: mujoco.MjModel) -> None:
-    """MuJoCo's own iterations: after training's single one a foot's force is a matter of chance, up to 12 weights."""
+    """Use MuJoCo's default iterations. After one, as in training, a foot force is random, up to 12 robot weights."""
     model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)
 
 
 class Witness:
-    """Samples everything that ``hard.looks`` reads, of one robot, once a physics step."""
+    """A recorder of one robot at each physics step, for ``hard.looks``."""
 
     def __init__(self, fleet: Fleet) -> None:
-        """``fleet`` has one robot, in its start pose, and calls ``sample`` each physics step."""
+        """``fleet`` has one robot in its start pose and calls ``sample`` at each physics step."""
         self.fleet, self.model, contract = fleet, fleet.model, fleet.contract
         self.trunk, self.feet = trunk_of(fleet.model), feet_of(fleet)
         self._joints = [self.model.joint(name).id for name in contract.joints]
@@ -185,22 +185,22 @@ class Witness:
         start = mujoco.MjData(self.model)
         start.qpos[:] = fleet.qpos[0]
         mujoco.mj_kinematics(self.model, start)
-        # the world's axes in each body's frame, as it stands: (1 + F, 3, 3)
+        # (1 + F, 3, 3) rotation from the world frame to each body's frame in the start pose
         self._bodies, self._level = bodies, start.xmat[bodies].reshape(-1, 3, 3).transpose(0, 2, 1).copy()
         self._data, self._now = mujoco.MjData(self.model), mujoco.MjData(self.model)
         self._rows: list[dict[str, Floats]] = []
 
     def forget(self) -> None:
-        """Begin the record anew."""
+        """Clear the record."""
         self._rows = []
 
     def sample(self) -> None:
-        """Keep this physics step."""
+        """Record this physics step."""
         data, now = self._data, self._now
         self.fleet.read_data(data)
         now.qpos[:] = data.qpos
         mujoco.mj_kinematics(self.model, now)
-        turned = now.xmat[self._bodies].reshape(-1, 3, 3) @ self._level  # (1 + F, 3, 3) how each has turned
+        turned = now.xmat[self._bodies].reshape(-1, 3, 3) @ self._level  # (1 + F, 3, 3) rotation since the start
         up = turned[0].T @ [0.0, 0.0, 1.0]
         x, y = now.qpos[:2]
         heading = math.atan2(turned[0][1, 0], turned[0][0, 0])
@@ -221,7 +221,7 @@ class Witness:
         )
 
     def _forces(self, data: mujoco.MjData) -> Floats:
-        """(F,) [N] of the ground on each foot, in the last physics step."""
+        """(F,) [N] ground force on each foot in the last physics step."""
         total, force = np.zeros((len(self.feet), 3)), np.zeros(6)
         for i, contact in enumerate(data.contact):
             pair = [int(geom) for geom in contact.geom]
@@ -235,7 +235,7 @@ class Witness:
         return np.linalg.norm(total, axis=1)
 
     def walk(self, targets: Floats) -> Walk:
-        """The record, with the policy's ``targets`` (P, D)."""
+        """The record and the policy's ``targets`` (P, D) [rad]."""
         kept: dict[str, Any] = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
         if not all(has_sole(self.model, geoms) for geoms in self.feet):
             kept["sole"] = None
@@ -257,24 +257,24 @@ class Witness:
 
 
 def feet_of(fleet: Fleet) -> list[list[int]]:
-    """The geoms of each foot: those that its contact sensors feel."""
+    """The geoms of each foot, which its contact sensors watch."""
     feet = fleet.contract.feet.values()
     return [[int(fleet.model.sensor(name).objid[0]) for name in names] for names in feet]
 
 
 def has_sole(model: mujoco.MjModel, geoms: Sequence[int]) -> bool:
-    """Whether a foot is flat: more than one sphere."""
+    """Whether a foot has a flat sole. A foot of one sphere has none."""
     return len(geoms) > 1 or model.geom_type[geoms[0]] != mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 # ---- pictures -------------------------------------------------------------------------------------------------------
 
 
-VIEWS = {"side": 90.0, "front": 180.0}  # [deg] azimuth of the camera: from the robot's right, and towards it
+VIEWS = {"side": 90.0, "front": 180.0}  # [deg] azimuth of the camera: at the robot's right, in front of it
 
 
 def strip_png(folder: Path, contract: Contract, poses: Sequence[Floats]) -> bytes:
-    """A PNG of one stride: a row from the side and a row from the front. Empty without poses, or without OpenGL."""
+    """A PNG of one stride: a row from the side and a row from the front. Empty without poses or OpenGL."""
     from legged_mw.view.recorder import contact_sheet, save_png  # imports OpenGL
     from legged_mw.view.stage import ViewError
 
@@ -291,7 +291,7 @@ def strip_png(folder: Path, contract: Contract, poses: Sequence[Floats]) -> byte
 
 
 def _frames(model: mujoco.MjModel, poses: Sequence[Floats]) -> list[NDArray[np.uint8]]:
-    """A picture of each pose from each of VIEWS. Raises ViewError."""
+    """One picture per pose and view of VIEWS. Raises ViewError."""
     from legged_mw.view.posed_robot import show_groups
     from legged_mw.view.recorder import no_context
     from legged_mw.view.stage import ViewError
@@ -301,7 +301,7 @@ def _frames(model: mujoco.MjModel, poses: Sequence[Floats]) -> list[NDArray[np.u
     model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
     try:
         renderer = mujoco.Renderer(model, height=HEIGHT, width=WIDTH)
-    except Exception as error:  # each OpenGL backend raises another type
+    except Exception as error:  # the type depends on the OpenGL backend
         raise ViewError(no_context(error)) from error
     data.qpos[:] = poses[0]
     mujoco.mj_forward(model, data)

@@ -1,4 +1,4 @@
-"""Record what ``legged_mw.eval.heat`` judges, on an export: motors' torques and speeds, and the switch to the policy."""
+"""Record motor torques and speeds, and the switch to the policy, of an export for ``legged_mw.eval.heat``."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from legged_mw.eval.heat import Motion, Switch
 from legged_mw.eval.skills import ExamRobot, ReferenceMotion, Skill
 from legged_mw.eval.walking import ExamRules
 
-STAND = 2.0  # [s] that the robot is held in its default pose before the policy [as deploy/states.py's RISE]
-AFTER = 0.5  # [s] after the switch in which its power is looked at
-SETTLING, SECONDS = 2.0, 10.0  # [s] of standing and of walking: at the start without a measure; in all
-TRIES = 8  # robots of a skill
+STAND = 2.0  # [s] in the default pose before the policy starts [RISE of deploy/states.py]
+AFTER = 0.5  # [s] of recorded power after the switch
+SETTLING, SECONDS = 2.0, 10.0  # [s] of standing and of walking: settling time, not recorded; total time
+TRIES = 8  # number of robots in a skill exam
 
 
 def run_heat(
     folder: Path, exam: ExamRules | Skill, edited: bool = False, scene: str | Path = SCENE_FILE
 ) -> dict[str, Any]:
-    """The result of ``heat.finish``: of a walker standing and walking, of a skill while it does what it is for.
+    """The result of ``heat.finish``, for standing and walking, or for the motion of a skill.
 
     ``edited``: see read_contract. ``scene``: see Fleet. Raises ContractError, UserError.
     """
@@ -56,7 +56,7 @@ def run_heat(
 
 
 class MotorLog:
-    """Torque and speed of every motor at each physics step."""
+    """A recorder of the motors' torques and speeds at each physics step."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -64,19 +64,19 @@ class MotorLog:
         self._speed: list[Floats] = []
 
     def sample(self) -> None:
-        """Keep this physics step."""
+        """Record this physics step."""
         self._torque.append(self._fleet.motor_torque())
         self._speed.append(self._fleet.motor_speed())
 
     def take(self) -> Motion:
-        """What was kept, and begin anew."""
+        """Return the record and clear it."""
         motion = Motion(np.stack(self._torque), np.stack(self._speed))
         self._torque, self._speed = [], []
         return motion
 
 
 def walk(stage: DeployStage, log: MotorLog, vx: float, holds: bool) -> tuple[dict[str, Motion | None], Switch | None]:
-    """A robot that its servos hold in the default pose (``holds``), then stands by its policy, then walks at ``vx``."""
+    """Let the servos hold the default pose (if ``holds``), then let the policy stand, then walk at ``vx`` [m/s]."""
     stand, ahead = (commands_of(stage.contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
     switch = switch_over(stage, log, stage.contract, stand) if holds else None
     motions: dict[str, Motion | None] = {}
@@ -88,9 +88,9 @@ def walk(stage: DeployStage, log: MotorLog, vx: float, holds: bool) -> tuple[dic
 
 
 def switch_over(stage: DeployStage, log: MotorLog, contract: Contract, stand: Floats) -> Switch | None:
-    """Hold the default pose for STAND, then start the policy; None if the robot falls then.
+    """Hold the default pose for STAND, then start the policy. None if the robot falls after that.
 
-    Meanwhile the root can sink but neither tilt nor slide, as if a person kept it upright: else a biped topples.
+    Before the policy starts, the root can only move vertically, as if a person held it. Otherwise a biped falls.
     """
     fleet, start = stage.fleet, stage.qpos()[0]
     for _ in range(round(STAND / stage.dt)):
@@ -108,7 +108,7 @@ def switch_over(stage: DeployStage, log: MotorLog, contract: Contract, stand: Fl
 
 
 def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
-    """Run the policy for ``seconds``; whether the robot fell."""
+    """Run the policy for ``seconds``. True if the robot fell."""
     fell = False
     for _ in range(round(seconds / stage.dt)):
         stage.step(command)
@@ -117,7 +117,7 @@ def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
 
 
 def perform(stage: DeployStage, log: MotorLog, skill: Skill) -> Motion | None:
-    """Those of TRIES robots that do not fall, in the first of the exam's starts on its first ground, the task's own."""
+    """Run TRIES robots on the skill exam's first ground, the task's own. The record of those that do not fall, or None."""
     said, follower = stage.contract.motion, stage.controller.follower
     motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
     robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)

@@ -1,8 +1,8 @@
 """The rough part of the walking exam: walk from the middle of a tile to its edge, on each kind and level of terrain.
 
 The robot starts near the middle of a tile with a random heading. The command is to walk ahead at 0.6 m/s.
-The terrain has the task's kinds, generated from another seed. The robot is nominal, without noise and pushes,
-by the same overrides as the walking exam.
+The terrain has the task's kinds, but another seed. The robot is nominal, without noise and pushes: the overrides are
+those of the walking exam.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from legged_mw.utils.task import LoadedTask
 
 # Commanded speed [m/s] and time limit [s]. The robot can walk 9 m in that time; a corner is 5.7 m away.
 SPEED, SECONDS = 0.6, 15.0
-# tiles per kind and level (of a slope, one goes up and one goes down); robots per tile
+# tiles per kind and level (one slope goes up, one goes down); robots per tile
 TILES, REPEATS = 2, 5
 
 OVERRIDES: dict[str, Any] = {
-    # keep the task's limit on the base's height: a trunk inside a step is a fall
+    # the task's limit on the base height stays: a robot whose trunk is inside a step has fallen
     **{path: value for path, value in rollout.OVERRIDES.items() if path != "termination.min_base_height"},
     "terrain.mesh_type": "heightfield",
     "terrain.curriculum": False,
     "terrain.num_rows": LEVELS,
-    # the same distance and the same steepest step for every task:
+    # the distance and the steepest step are the same for every task
     "terrain.tile_size": 8.0,  # [m]
     "terrain.horizontal_scale": 0.05,  # [m]
     "terrain.difficulty": [0.0, 1.0],
@@ -43,19 +43,19 @@ OVERRIDES: dict[str, Any] = {
     "init_state.pos_xy_range": 0.3,
     "init_state.yaw_range": math.pi,
 }
-# config fields that the user may not override
+# config fields that a user may not override
 SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}
 
 
 def prepare(task: LoadedTask, repeats: int = REPEATS) -> None:
-    """Turn ``task`` into the rough part."""
+    """Set the exam's overrides, tiles and number of worlds in ``task``."""
     for path, value in OVERRIDES.items():
         task.set(path, value, where="exam")
     make_room(task, repeats)
 
 
 def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
-    """Set up tiles of each kind with a share in ``terrain.terrain_proportions``, and ``repeats`` robots per tile."""
+    """Set the tiles: all kinds with a share in ``terrain.terrain_proportions``, and ``repeats`` robots per tile."""
     ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0]
     if not kinds:
@@ -67,7 +67,7 @@ def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
 
 
 def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
-    """Grade ``policy`` in the environment of a prepared task: the shares of crossings and falls by kind and level."""
+    """Grade ``policy`` in the environment of a prepared task. Returns shares of crossings and falls by kind and level."""
     assert env.tiles
     kinds = env.tiles.kinds
     repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds are sorted by kind, column, level
@@ -82,7 +82,7 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 
 def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
-    """Two masks (N,): worlds that moved ``edge`` [m] from the middle along x or y, and worlds that fell before that."""
+    """Two masks (N,): worlds that moved ``edge`` [m] from the middle in x or y, and worlds that fell before."""
     command = torch.tensor(
         [SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device
     )
@@ -99,12 +99,12 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
         over |= dones
         crossed |= (env.max_distance[:, 0] > edge) & ~over
         over |= crossed
-        env.commands.copy_(command)  # a reset redraws it; worlds that were reset no longer count
+        env.commands.copy_(command)  # a reset draws new commands; worlds that were reset do not count
     return crossed, fell
 
 
 def _measure(kind: str) -> dict[str, Any]:
-    """The quantity that makes a kind hard, and its value at each level; None if there is none."""
+    """The measure of difficulty of a kind and its value at each level; None if there is none."""
     if kind not in MEASURES:
         return {"measure": None, "values": None}
     return {
@@ -114,7 +114,7 @@ def _measure(kind: str) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The share of crossings, one line per kind and one column per level, then the mean shares crossed and fallen."""
+    """A text table of the shares of crossings: a line per kind, a column per level, then the mean shares and falls."""
     kinds = result["kinds"]
     lines = [
         f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"
