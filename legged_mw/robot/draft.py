@@ -1,7 +1,4 @@
-"""A first task for a new robot: guess its feet, compute its pose, gains and height. As values, and as a config file.
-
-The file marks guessed and chosen values with LOOK.
-"""
+"""Draft a first task for a new robot: guess its feet, compute its pose, gains and height, and return config values."""
 
 from __future__ import annotations
 
@@ -46,21 +43,22 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import import_task
 
-LOW = 0.33  # [m] a robot with a lower root gets a lower foot swing
-# factors on the suggested gains; published gains are at most twice the suggested ones [ours]
+LOW = 0.33  # [m] a robot with a lower root gets a lower swing height
+# factors on the suggested gains; published gains are at most twice the suggested gains [ours]
 FIRMNESS = (1.0, 1.25, 1.5, 2.0)
-# of the solver under implicitfast [ours: with 10 both engines agree to 1e-5 rad/s, with 3 a T1 is off by 7 rad/s a step]
+# solver options with implicitfast [ours: the engines agree to 1e-5 rad/s with 10; with 3 a T1 is off by 7 rad/s a step]
 IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 20}
-# reward terms for how a quadruped's walk looks: joints without jerks, feet that are put down softly; UprightBipedCfg has
-# a biped's [ours, of legged_gym's, walk-these-ways' and Playground's terms]
+# reward scales for a smooth walk of a quadruped: small joint accelerations and foot impacts; those of a biped are in
+# UprightBipedCfg [ours, from terms of legged_gym, walk-these-ways and Playground]
 LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25, "target_limits": -1.0}
-# of `energy`, per kilogram: -0.001 of a G1 of 35 kg (docs/archive/go2_and_g1.md), Playground's -0.001 of a Go1 of 13 kg
+# number of feet -> scale of `energy` x robot's mass [kg]: -0.001 for a G1 of 35 kg (docs/archive/go2_and_g1.md), -0.001
+# for a Go1 of 13 kg [Playground]
 ENERGY = {2: -0.035, 4: -0.013}
-SLIPPERY = [0.25, 1.2]  # friction of a quadruped's ground [-] [ours: an ANYmal C that knew 0.4 and more fell at 0.3]
-# [s], [m/s] each axis, [rad/s] likewise [go2_rl_gym: 4, 0.4, 0.6]
+SLIPPERY = [0.25, 1.2]  # friction of a quadruped's ground [-] [ours: an ANYmal C trained with 0.4 or more fell at 0.3]
+# [s], [m/s] per axis, [rad/s] per axis [go2_rl_gym: 4, 0.4, 0.6]
 PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 0.5, "max_push_ang_vel": 0.6}
-BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # of a biped that follows a gait clock
-CLEARANCE = 0.003  # [m] above the ground at reset, so that no geom starts inside it
+BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # reward scales of a biped that follows a gait clock
+CLEARANCE = 0.003  # [m] height of the feet above the ground at reset, so that no geom penetrates it
 
 
 class Draft(NamedTuple):
@@ -75,20 +73,20 @@ class Draft(NamedTuple):
     guessed: list[str]  # guessed values, one line each
     pose_from: str  # source of the default pose, as text
     notes: list[str]  # dropped, added, changed and fused parts of the file, one line each
-    maker: Maker | None  # what its maker publishes, if that is known
+    maker: Maker | None  # values that the maker publishes, if known
     gains_from: str  # source of the gains, as text
-    judged: list[Judged]  # the poses that were judged, the chosen one first
-    simple: bool  # alike worlds and a told velocity, in place of what a real robot asks for
-    angles: dict[str, float]  # joint -> default angle [rad], those that are held too
-    wheels: list[str]  # joints that roll, for which a draft has no motor law
+    judged: list[Judged]  # the judged poses, the chosen one first
+    simple: bool  # True: equal worlds and an observed base velocity; False: a task for a real robot
+    angles: dict[str, float]  # joint -> default angle [rad], held joints included
+    wheels: list[str]  # joints of wheels; a draft has no motor law for them
 
     @property
     def held(self) -> list[str]:
-        """The joints that do not walk."""
+        """The joints that the policy does not control."""
         return [name for name in self.angles if name not in self.robot.joint_names]
 
     def stands(self, judged: Judged) -> NDArray[np.float64]:
-        """The robot in a judged pose (7 + D,), on its feet; held joints stay as they are."""
+        """qpos (7 + D,) of the robot standing in a judged pose, without the held joints."""
         angles = dict(zip(self.angles, judged.candidate.angles, strict=True))
         return np.array(
             [0.0, 0.0, judged.height, 1.0, 0.0, 0.0, 0.0, *(angles[name] for name in self.robot.joint_names)]
@@ -96,7 +94,7 @@ class Draft(NamedTuple):
 
 
 def draft(file: Path, simple: bool = False) -> Draft:
-    """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF)."""
+    """Guess the numbers of a first task for the robot in ``file`` (MJCF or URDF). Raises ModelError."""
     read = read_robot(file)
     from_file = read.keyframe is not None
     env = _bare(file, from_file)
@@ -136,7 +134,7 @@ def draft(file: Path, simple: bool = False) -> Draft:
     wheels = find_wheels(robot, np.array(pose))
     if wheels:
         guessed.append(f"wheels: {', '.join(wheels)}: without a range, and round about their axis")
-    # the only site of a bare robot is its IMU
+    # the only site of a robot without a task is its IMU
     more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     notes = [*read.notes, *more]
     return Draft(
@@ -152,10 +150,10 @@ def _servos(
     feet: Sequence[Foot],
     maker: Maker | None,
 ) -> tuple[list[Gains], str]:
-    """Gains of each joint, and where they come from: the maker's, else as suggested, else firmer.
+    """The gains of each joint and their source: the maker's gains, or the suggested gains times a factor of FIRMNESS.
 
-    On more than two feet the robot must stand on them: else the maker's are not taken, and of FIRMNESS the smallest on
-    which it does. A biped falls on any.
+    A robot with more than two feet must stand with its gains. If it sinks with the maker's, they are not used. The
+    factor is the smallest with which it stands. A biped falls with any gains.
     """
     names = robot.joint_names
     kp, kd = (maker.of(table, names) if maker else {} for table in ("kp", "kd"))
@@ -186,7 +184,7 @@ def _stands(
     feet: Sequence[Foot],
     gains: Sequence[Gains],
 ) -> bool:
-    """Whether the robot stands on its feet with these ``gains``."""
+    """Whether the robot stands with these ``gains``; only its feet collide."""
     model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
     for geom in range(robot.ground_geoms().stop, model.ngeom):
         model.geom_conaffinity[geom] *= model.geom(geom).name in touching
@@ -200,7 +198,7 @@ def _stands(
 
 
 def _bare(file: Path, keyframe: bool, held: Sequence[str] = (), angles: Mapping[str, float] | None = None) -> RobotTask:
-    """One world with only the robot, in the pose of the file's ``keyframe``, at ``angles``, or with all joints at 0."""
+    """One world of the robot without a task, in the file's ``keyframe``, at ``angles``, or with all joints at 0."""
     cfg = RobotTaskCfg()
     fields = {
         **{
@@ -235,7 +233,7 @@ def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]
 
 
 def has_mirror(env: LeggedRobot) -> bool:
-    """Whether the robot and its pose are symmetric left to right, so that learning may use the symmetry."""
+    """Whether the robot and its pose are symmetric, so that the learner can use the symmetry."""
     try:
         return env.mirror is not None
     except (ModelError, ConfigError):
@@ -283,19 +281,19 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
 
 
 def _energy(found: Draft) -> dict[str, float]:
-    """The scale of `energy`: a heavier robot needs more power to walk as fast."""
+    """The scale of `energy`. It is smaller for a heavier robot, which needs more power at the same speed."""
     mass = float(found.robot.physics.body_subtreemass[0])
     return {"energy": float(f"{ENERGY.get(len(found.feet), ENERGY[4]) / mass:.2g}")}
 
 
 def _worlds(found: Draft, shares: tuple[float, float]) -> dict[str, Any]:
-    """Randomized worlds: what differs with the robot's size, and delays. ``shares`` of the mass, on the root."""
+    """Domain randomization: delays, and the load on the root, ``shares`` (low, high) of the robot's mass."""
     mass = float(found.robot.physics.body_subtreemass[0])
     return {"base_mass": [round(share * mass, 2) for share in shares], "delay_ms": [0.0, 20.0]}
 
 
 def _motors(found: Draft) -> dict[str, dict[str, float]]:
-    """What a maker publishes of motors where the robot's file says nothing: armature [kg m^2], effort [N m]."""
+    """The maker's armature [kg m^2] and effort [N m] of joints for which the robot's file has none."""
     if not found.maker:
         return {}
     bare = [joint.name for joint in found.joints if not joint.armature]
@@ -305,7 +303,7 @@ def _motors(found: Draft) -> dict[str, dict[str, float]]:
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Further values for a biped: they replace BipedCfg's numbers of a G1; a simple task leaves out what is hard."""
+    """The config values of a biped, in place of BipedCfg's values for a G1. A simple task has fewer difficulties."""
     robot = found.robot
     data = posed(robot.physics, found.pose)
     left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
@@ -330,7 +328,7 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def patterns(held: Sequence[str], moving: Sequence[str]) -> list[str]:
-    """Short patterns that fit all ``held`` joints and none that moves: by the first word of a name without its side."""
+    """Short patterns that match all ``held`` joints and no ``moving`` joint, from the first words of their names."""
     found = list[str]()
     for name in held:
         words = family(name)
@@ -342,7 +340,7 @@ def patterns(held: Sequence[str], moving: Sequence[str]) -> list[str]:
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
-    """``numbers`` (D,) as a short table: the most frequent for all, other values by family or name of a joint."""
+    """``numbers`` (D,) as a short table: "" has the most frequent value; a joint's family or name has another value."""
     common = Counter(numbers).most_common(1)[0][0]
     short, exact = {"": common}, dict(zip(names, numbers, strict=True))
     for name, number in exact.items():
@@ -354,7 +352,7 @@ def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
 
 
 def short_table(said: dict[str, float], names: Sequence[str]) -> dict[str, float]:
-    """``table`` of numbers that are known for all ``names``; else ``said`` itself."""
+    """``table`` of ``said`` if it has a value for each of ``names``; else ``said`` itself."""
     return table([said[name] for name in names], names) if len(said) == len(names) else said
 
 
@@ -367,7 +365,7 @@ def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[f
 
 # ---- the feet: the lowest bodies without children, and bodies of the same family on other legs
 
-# [m], and share of the robot's height: ends of limbs up to this much higher than the lowest one are feet too
+# [m], share of the robot's height: the end of a limb is a foot if it is at most this much higher than the lowest one
 _SAME, _SAME_SHARE = 0.03, 0.08
 _SOLE = 0.015  # [m] geoms up to this much higher than the lowest geom of a foot belong to its sole
 
@@ -399,7 +397,7 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     lowest = min(min(these.values()) for these in of_body.values())
     near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
     soles = {body: _sole(model, these) for body, these in of_body.items() if min(these.values()) <= near}
-    for body, these in of_body.items():  # a lifted leg has the same kind of foot
+    for body, these in of_body.items():  # the foot of a lifted leg is not low
         same = [
             other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))
         ]
@@ -409,7 +407,7 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
 
 
 def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequence[Foot]) -> None:
-    """Raise ModelError if the file's mesh of a low end of a limb cannot be read: it may be a foot."""
+    """Raise ModelError if a mesh at the low end of a limb cannot be read, because it may be a foot."""
     model, data = robot.physics, posed(robot.physics, qpos[7:], qpos[:7])
     low = min(float(data.geom_xpos[robot.id("geom", geom), 2]) for foot in feet for geom in foot.geoms)
     for body in {*range(1, model.nbody)} - {*model.body_parentid}:
@@ -420,7 +418,7 @@ def _refuse_lost_feet(robot: RobotModel, qpos: NDArray[np.float64], feet: Sequen
 
 
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
-    """The sole of a body: its lowest geom, and geoms of that type at about that height.
+    """The sole of a body: its lowest geom, and geoms of the same type at about the same height.
 
     ``low``: geom -> z of its lowest point [m, world frame].
     """
@@ -431,7 +429,7 @@ def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
 def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     """The foot with these geoms of ``body``, named by its geom or body."""
     names = tuple(robot.physics.geom(geom).name for geom in geoms)
-    # also bodies that are fused in the simulated model
+    # includes bodies that are fused in the simulated model
     parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]
     if parts:
         return Foot(parts[-1], names, True)
@@ -440,7 +438,7 @@ def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
 
 
 def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
-    """Feet whose name is that of a geom, as FL_calf_4, are called by their side: FL_foot, if nothing else is."""
+    """Rename feet with a generated geom name by their side: FL_calf_4 becomes FL_foot, if that name is free."""
     new = list[Foot]()
     for foot in feet:
         owner = robot.physics.body(int(robot.physics.geom(foot.geoms[0]).bodyid[0])).name
@@ -456,11 +454,11 @@ def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
 
 # ---- weights of the pose reward
 
-# of two feet, with a gait clock: from configs/robots/g1.py; arms and waist have its waist's weight, so that they are quiet
+# a biped with a gait clock: weights of configs/robots/g1.py; arms and waist have the waist's weight, so they move little
 WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
-# without: 1 / (29 std^2) of mjlab's standard deviations while a G1 walks, 0.5, 0.15 and 0.1 rad
+# a biped without: 1 / (29 std^2), with mjlab's standard deviations of a walking G1: 0.5, 0.15, 0.15 and 0.1 rad
 UPRIGHT = (0.14, 1.5, 1.5, 3.4)
-KNEE_WALKS = 0.1  # on more feet, where all other joints have 1 [MuJoCo Playground]
+KNEE_WALKS = 0.1  # with more feet; all other joints have 1 [MuJoCo Playground]
 
 
 def pose_weights(
@@ -469,9 +467,9 @@ def pose_weights(
     feet: Sequence[Foot],
     biped: tuple[float, float, float, float] = (WALKS, ANKLE, HELD, QUIET),
 ) -> list[float]:
-    """Weights (D,) of the pose reward: smallest for what walks (hip and knee; on more than two feet the knee alone).
+    """Weights (D,) of the pose reward. Hip and knee have the smallest weights; with more than two feet only the knee.
 
-    ``biped``: on two feet, those of hip and knee, of the ankle, of a leg's other joints, and of arms and waist.
+    ``biped``: the weights with two feet: hip and knee, ankle, other leg joints, arms and waist.
     """
     walks, ankle, held, quiet = biped
     model, data = robot.physics, posed(robot.physics, pose)
