@@ -1,13 +1,13 @@
-"""A robot's health page as numbers, computed by MuJoCo on a CPU: standing, stability of its servos, initial gains.
+"""Compute the numbers of a robot's health page with MuJoCo on a CPU: standing, stability of its servos, initial gains.
 
 Shapes: D joints, V degrees of freedom (the first 6 are the root's), P points. Independent of configs and tasks.
 
 The servo of one joint with inertia I and time step dt is
 v' = v - d v - s x / dt, x' = x + dt v', with d = dt kd / I and s = dt^2 kp / I.
 Its characteristic polynomial is z^2 - (2 - s - d) z + (1 - d). By Jury's conditions it is stable for 0 < d < 2 and
-2 d + s < 4: without damping dt sqrt(kp / I) < 2, without stiffness dt kd / I < 2. For d >= 1 the damping alone changes
+2 d + s < 4: without damping dt sqrt(kp / I) < 2, without stiffness dt kd / I < 2. For d > 1 the damping alone changes
 the sign of the velocity in every substep: the joint rings. The integrator implicitfast uses v' in place of v in the
-damping: any d is stable, and s < 4 + 2 d.
+damping. Then it is stable for any d and s < 4 + 2 d.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from legged_mw.sim.robot_file import tilt
 FloatArray = NDArray[np.float64]
 
 STAND_SECONDS = 5.0  # [s] duration of the standing test
-STAND_TILT = 60.0  # [deg] of the root; a larger tilt is a fall
-STAND_HEIGHT = 0.5  # share of the initial height; below it, the robot sank
-TOPPLED = 15.0  # [deg] beyond this tilt the rigid robot does not rest on its feet
+STAND_TILT = 60.0  # [deg] a larger tilt of the root is a fall
+STAND_HEIGHT = 0.5  # share of the initial height; the robot sinks if it is lower
+TOPPLED = 15.0  # [deg] with a larger tilt, the rigid robot does not rest on its feet
 GRAVITY = 9.81  # [m/s^2]
 _STIFF = 1e5  # [kg m^2] armature that locks a joint: 100 N m accelerate it by 1 mrad/s^2
-_FAST = 1.0e4  # [m/s, rad/s] a faster state counts as diverged (termination.max_speed)
+_FAST = 1.0e4  # [m/s, rad/s] a faster state has diverged (termination.max_speed)
 
 
 class Rest(NamedTuple):
@@ -48,7 +48,7 @@ class Rest(NamedTuple):
     com: FloatArray  # (3,) centre of mass [m]
     contacts: int
     rows: int  # constraint rows of the simulated model: contacts, dry friction, active limits
-    toppled: bool  # the robot falls over; torques and points are then those of a root that is held upright
+    toppled: bool  # whether the robot falls over; if so, torque and points are computed with the root held upright
 
 
 class Joint(NamedTuple):
@@ -64,7 +64,7 @@ class Joint(NamedTuple):
     kd: float  # [N m s/rad]
     inertia: float  # [kg m^2] smallest inertia over the poses, with all other joints free
     pose: str  # the pose with this inertia
-    held: float  # [kg m^2] inertia in the default pose with all else locked: diagonal of the mass matrix
+    held: float  # [kg m^2] inertia in the default pose with all other joints locked: diagonal of the mass matrix
     torque: float  # [N m] at rest
 
     def damping_step(self, dt: float) -> float:
@@ -84,7 +84,7 @@ class Joint(NamedTuple):
         return abs(self.torque) / self.kp if self.kp else math.inf
 
     def verdict(self, dt: float, implicit: bool) -> str:
-        """The servo's stability at this time step: "" (stable), "rings" or "unstable"; see the top of this file."""
+        """The servo's stability at time step ``dt``: "" (stable), "rings" or "unstable"; see the top of this file."""
         d, s = self.damping_step(dt), self.stiffness_step(dt) ** 2
         if s >= 4.0 + 2.0 * d if implicit else (d >= 2.0 or 2.0 * d + s >= 4.0):
             return "unstable"
@@ -92,16 +92,16 @@ class Joint(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """The fastest growing mode of all servos together, without ground contact."""
+    """The fastest growing mode of the robot with all servos, without ground contact."""
 
-    growth: float  # factor per substep; 1 is the undamped free root
+    growth: float  # factor per substep; 1 belongs to the undamped free root
     joints: tuple[str, ...]  # joints with the largest amplitude
 
 
 class Stand(NamedTuple):
-    """The result of the standing test: servos on, action zero."""
+    """The result of the standing test: the servos hold the pose of action zero."""
 
-    seconds: float  # time until it fell, sank or diverged; else STAND_SECONDS
+    seconds: float  # time until the robot fell, sank or diverged; else STAND_SECONDS
     end: str  # "stands", "falls", "sinks" or "diverges"
     joints: tuple[str, ...] = ()  # the fastest joints, if it diverges
 
@@ -111,8 +111,8 @@ class RobotNumbers:
     """All numbers of the health page."""
 
     mass: float  # [kg]
-    height: float  # [m] of the root above the ground, at rest
-    top: float  # [m] of the robot's highest point
+    height: float  # [m] height of the root above the ground, at rest
+    top: float  # [m] height of the robot's highest point
     margin: float  # [m] from the centre of mass to the edge of the support polygon; negative: outside
     rest: Rest
     joints: tuple[Joint, ...]
@@ -120,18 +120,18 @@ class RobotNumbers:
     stand: Stand
     dt: float  # [s] substep
     implicit: bool  # whether the integrator is implicitfast
-    room: Capacity  # for contacts and constraint rows in mujoco-warp
+    room: Capacity  # capacity for contacts and constraint rows in mujoco-warp
 
     @property
     def moment(self) -> float:
-        """Weight times the height of the root [N m], of ``suggest``."""
+        """Weight times the height of the root [N m], for ``suggest``."""
         return GRAVITY * self.mass * self.height
 
 
 def measure(
     robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5, rough: bool = False
 ) -> RobotNumbers:
-    """The numbers of ``robot``, upright on level ground in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m].
+    """The numbers of ``robot`` in ``pose`` (D,) [rad], upright on level ground, with its root at ``place`` (3,) [m].
 
     ``rough``: compute the buffer capacity for rough terrain.
     """
@@ -165,7 +165,7 @@ def stand_as_statue(robot: RobotModel, pose: FloatArray, place: FloatArray) -> R
     model, data = robot.physics, mujoco.MjData(robot.physics)
     data.qpos[:] = free.qpos
     mujoco.mj_forward(model, data)
-    torque = free.qfrc_bias - free.qfrc_constraint - free.qfrc_spring  # the torques that the servos need for no motion
+    torque = free.qfrc_bias - free.qfrc_constraint - free.qfrc_spring  # the servo torques at zero acceleration
     ground = robot.ground_geoms()
     touching = [c.pos for c in free.contact if any(ground.start <= geom < ground.stop for geom in c.geom)]
     points = np.array(touching).reshape(-1, 3)
@@ -182,7 +182,7 @@ def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: boo
     if upright:
         model.dof_armature[3:6] = _STIFF
     mass, size = float(model.body_subtreemass[0]), max(float(place[2]), 0.1)
-    model.dof_damping[:6] = [10.0 * mass] * 3 + [3.0 * mass * size**2] * 3  # strong enough for rest within a second
+    model.dof_damping[:6] = [10.0 * mass] * 3 + [3.0 * mass * size**2] * 3  # the robot is at rest within a second
     data = mujoco.MjData(model)
     data.qpos[:] = [*place, 1.0, 0.0, 0.0, 0.0, *pose]
     for _ in range(20):
@@ -208,19 +208,19 @@ def _corners(points: FloatArray) -> FloatArray:
 
 
 def _turn(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
-    """Positive where the way from a over b to c, (2,) each, turns to the left."""
+    """Positive if the path from a over b to c, (2,) each, turns left."""
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
 def inside_by(points: FloatArray, place: FloatArray) -> float:
     """The distance [m] of ``place`` (2,) to the edge of the convex hull of ``points`` (P, 2) [m]; negative if outside.
 
-    It is the smallest support distance of the hull from ``place`` over all directions. The minimum is normal to a line
-    through two of the points, or along the line from a point to ``place``.
+    It is the smallest support distance of the hull from ``place`` over all directions. The direction of the minimum is
+    normal to a line through two of the points, or along the line from a point to ``place``.
     """
     if not len(points):
         return -math.inf
-    away = (_corners(points) if len(points) > 32 else points) - place  # a mesh on the ground has thousands of pairs
+    away = (_corners(points) if len(points) > 32 else points) - place  # corners: the number of pairs is quadratic
     ways = np.concatenate([(away[:, None] - away[None]).reshape(-1, 2) @ [[0.0, 1.0], [-1.0, 0.0]], -away])
     lengths = np.linalg.norm(ways, axis=1)
     ways = ways[lengths > 1e-9] / lengths[lengths > 1e-9, None]
@@ -228,7 +228,7 @@ def inside_by(points: FloatArray, place: FloatArray) -> float:
 
 
 def _highest(robot: RobotModel, qpos: FloatArray) -> float:
-    """The highest point of the robot's geoms [m], visuals included."""
+    """The height [m] of the highest point of the robot's geoms, visual geoms included."""
     model = robot.spec.copy().compile()
     data = posed(model, qpos[7:], qpos[:7])
     geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid])
@@ -241,10 +241,10 @@ def _highest(robot: RobotModel, qpos: FloatArray) -> float:
 
 
 def mass_matrices(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
-    """Mass matrices (V, V) with armature, root upright, for four poses.
+    """Mass matrices (V, V) with armature, for four poses with an upright root.
 
-    "default" is ``pose`` (D,). "low", "middle" and "high" have all joints at that point of their ranges; the range of a
-    joint without limits is ``pose`` +- 1 rad.
+    "default" is ``pose`` (D,) [rad]. "low", "middle" and "high" have all joints at that point of their ranges. A joint
+    without limits has the range ``pose`` +- 1 rad.
     """
     limited = robot.physics.jnt_limited[1:] > 0
     low, high = robot.joint_range.T
@@ -304,7 +304,7 @@ def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:
 
 
 def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float], decimation: int) -> Stand:
-    """Simulate the robot from ``pose`` (D,) with servo targets at ``pose``, as a task does at action zero."""
+    """Simulate the robot from ``pose`` (D,) [rad] with servo targets at ``pose``, like a task with action zero."""
     sim = make_simulation(robot.physics, 1, "cpu", engine="mujoco", nconmax=0, njmax=0)
     qpos, qvel = sim.qpos.numpy()[0], sim.qvel.numpy()[0]
     qpos[:], sim.ctrl.numpy()[0] = [*place, 1.0, 0.0, 0.0, 0.0, *pose], pose
@@ -326,11 +326,11 @@ def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float],
 
 # ---- initial gains: our rules ----
 
-UPRIGHT = 0.4  # share of the robot's weight times its height that a servo is to bear at 1 rad
-LOAD, SAG = 2.0, 0.4  # multiple of the torque at rest, and position error [rad] at that torque
-SWING = 2.0  # [Hz]
+UPRIGHT = 0.4  # servo torque at 1 rad / (robot's weight x height of the root)
+LOAD, SAG = 2.0, 0.4  # factor on the torque at rest; largest position error [rad] at that torque
+SWING = 2.0  # [Hz] natural frequency of a limb
 DAMPING_TIME = 0.025  # [s] kd / kp
-MOST = 0.5  # of dt sqrt(kp / I) and of dt kd / I, in explicit Euler
+MOST = 0.5  # largest dt sqrt(kp / I) and dt kd / I for explicit Euler
 
 
 class Gains(NamedTuple):
@@ -343,11 +343,11 @@ class Gains(NamedTuple):
 def suggest(joints: Sequence[Joint], moment: float, firmness: float = 1.0) -> list[Gains]:
     """Gains for each joint: ``firmness`` times the rules. Left and right joints of a pair get equal gains.
 
-    ``moment`` [N m]: the robot's weight times the height of its root. Published gains go with the motor, and with what
-    a fall of the whole robot asks of it, so kp [N m/rad] is the geometric mean of two: full effort at 1 rad, and 0.4 of
-    the moment at 1 rad. A lower bound is the kp that holds twice the torque at rest with an error of 0.4 rad, because
-    in a walk half of the feet carry the robot. Without a known effort, kp is this bound, and at least the kp that
-    swings the limb at 2 Hz. kd [N m s/rad]: 25 ms of kp. docs/your_own_robot.md has both beside what makers publish.
+    ``moment`` [N m]: the robot's weight times the height of its root. Published gains grow with the motor's effort and
+    with the moment. So kp [N m/rad] is the geometric mean of effort / 1 rad and 0.4 moment / 1 rad. Its lower bound
+    holds twice the torque at rest with an error of 0.4 rad, because half of the feet carry a walking robot. If the
+    effort is unknown, kp is this bound, or the kp of a limb with a natural frequency of 2 Hz if that is larger. kd [N m
+    s/rad] is 25 ms x kp. docs/your_own_robot.md compares these gains with published gains.
     """
     wanted = [firmness * _wanted(joint, moment) for joint in joints]
     gains = []
@@ -359,7 +359,7 @@ def suggest(joints: Sequence[Joint], moment: float, firmness: float = 1.0) -> li
 
 
 def beyond_euler(joints: Sequence[Joint], gains: Sequence[Gains], dt: float) -> list[Joint]:
-    """The joints whose ``gains`` ask for the integrator implicitfast: explicit Euler bears MOST in a substep."""
+    """The joints whose ``gains`` need the integrator implicitfast, because they exceed MOST at substep ``dt`` [s]."""
     with_gains = [joint._replace(kp=gain.kp, kd=gain.kd) for joint, gain in zip(joints, gains, strict=True)]
     return [joint for joint in with_gains if max(joint.stiffness_step(dt), joint.damping_step(dt)) > MOST]
 

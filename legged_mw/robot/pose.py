@@ -1,12 +1,11 @@
-"""The default pose of a draft: candidates, and a judge that says what is wrong with each.
+"""Choose the default pose of a draft: make candidates, find the faults of each, and sort them.
 
-Candidates are the file's keyframe, the pose that the maker publishes, crouches that are computed here, and all joints at
-0. The file's keyframe is taken if it has no fault, else the maker's pose, else the best crouch. If all have faults, the
-least bad of them is taken.
+Candidates are the file's keyframe, the maker's published pose, computed crouches, and all joints at 0. The first of
+them without a fault is chosen; of the crouches, the best one. If all have faults, the pose with the fewest is chosen.
 
-A leg is the chain of joints from the root to a foot. Its joints about the sideways axis move the foot in a plane: the
-first is the hip, the last one of a foot with a flat sole levels that sole, and of those between, the knee is the one that
-changes the leg's length most. Angles of the sole are rotations about y (left) [rad]; lengths are in metres.
+A leg is the chain of joints from the root to a foot. Its pitch joints (axis along y) move the foot in a plane. The
+first is the hip. If the sole is flat, the last one levels it. Of the others, the knee changes the leg's length most.
+Angles of the sole are rotations about y (left) [rad]; lengths are in metres.
 """
 
 from __future__ import annotations
@@ -27,59 +26,57 @@ from legged_mw.sim.surface_points import SPACING, spheres_on, surfaces
 
 FloatArray = NDArray[np.float64]
 
-# Ours: how far a knee that can be straight is bent, by number of feet. Published: G1 and H1 0.3, T1 0.4; ANYmal 1.1, of its straight leg.
-FOLD, FOLD_ELSE = {2: 0.35}, 0.95  # [rad]
-# A knee that cannot be straight is bent so that the leg has this share of its stroke, from shortest to longest. With it
-# A1, Go2 and B2 bend by 1.43 to 1.55 rad; their makers say 1.5.
+# Ours: bend of a knee that can be straight, by number of feet. Published: G1 and H1 0.3, T1 0.4, ANYmal 1.1.
+FOLD, FOLD_ELSE = {2: 0.35}, 0.95  # [rad] from the straight leg
+# Bend of a knee that cannot be straight: the leg's length is at this share of its range, from shortest to longest. It
+# bends the knees of A1, Go2 and B2 by 1.43 to 1.55 rad; their makers publish 1.5.
 STROKE = 0.73
-DEPTHS = (0.5, 1.0, 1.5)  # multiples of the bend above, for the candidates
-_STRAIGHT = 0.995  # a knee can be straight if the leg then has this share of its length
-SIDEWAYS = 0.9  # least |y| of the axis of a sideways joint
-_BEHIND = 0.03  # [m] with the foot this far behind the knee, the leg bends the other way (ANYmal's hind legs)
+DEPTHS = (0.5, 1.0, 1.5)  # factors on this bend, one candidate each
+_STRAIGHT = 0.995  # a knee can be straight if it allows this share of the leg's largest length
+SIDEWAYS = 0.9  # smallest |y| of the axis of a pitch joint
+_BEHIND = 0.03  # [m] if the foot is more than this behind the knee, the knee bends the other way (ANYmal's hind legs)
 _MARGIN = 0.05  # [rad] distance of a computed angle to the limits of a joint
-_FLAT = 0.04  # [m] a sole of this length is flat
-_THIN = 0.004  # [m] points of a sole this far above its lowest one lie in its plane
-_PRESSED = 0.015  # [m] points of a sole this far above its lowest one touch the ground under the robot's weight
+_FLAT = 0.04  # [m] a flat sole is longer than this
+_THIN = 0.004  # [m] points of a sole up to this far above its lowest point are in its plane
+_PRESSED = 0.015  # [m] points of a sole up to this far above its lowest point touch the ground under the robot's weight
 
-# Bounds of the judge; ours. Go2's keyframe has a reach of 0.62 and a height 2 cm off; B2's folded robot has 0.22 and 35.
-AT_LIMIT = 0.02  # [rad] a joint nearer to its limit is at it
-FOLDED, UPRIGHT = 0.45, 0.1  # least share of the straight leg's length; least bend of a knee [rad]
-TILTED = 0.15  # [rad] of a flat sole
-AWAY = 0.35  # of the leg's length: foot from below its hip, along x
-HEIGHT = 0.2  # of the leg's length: the keyframe's height against the computed one
-UNEVEN = 0.1  # of the leg's length: lowest points of the feet
-BEND = 0.4  # [rad] of a knee, from the wanted bend: counts as much as a sag of SAG
+# Limits of the faults; ours. Go2's keyframe has a reach of 0.62 and a height error of 2 cm, B2's folded pose 0.22, 35 cm.
+AT_LIMIT = 0.02  # [rad] distance to a joint's limit
+FOLDED, UPRIGHT = 0.45, 0.1  # smallest reach: share of the straight leg's length; smallest bend of a knee [rad]
+TILTED = 0.15  # [rad] tilt of a flat sole
+AWAY = 0.35  # share of the leg's length: distance of the foot from below the hip, along x
+HEIGHT = 0.2  # share of the leg's length: error of the keyframe's height
+UNEVEN = 0.1  # share of the leg's length: difference in height between the feet
+BEND = 0.4  # [rad] error of a knee's bend that counts as much as a sag of SAG
 
 
 class Sole(Protocol):
-    """A foot: its geoms."""
+    """A foot."""
 
     @property
     def geoms(self) -> tuple[str, ...]: ...
 
 
 class _Whole(NamedTuple):
-    """A foot with all of its body's geoms that collide: a tilted sole shows its lowest ones alone."""
+    """A foot with all colliding geoms of its body. Without them, a tilted sole would have only its lowest geoms."""
 
     geoms: tuple[str, ...]
 
 
 class Leg(NamedTuple):
-    """A leg in its plane, at the neutral pose. P points of the sole."""
+    """A leg in its plane, in the neutral pose. P points of the sole."""
 
-    joints: tuple[int, ...]  # sideways joints from hip to foot, indices of the model
-    knee: int  # place in ``joints``
-    rest: FloatArray  # (joints,) [rad] their neutral angles
-    spare: (
-        FloatArray  # (joints,) [rad] turns of those that are neither hip, knee nor ankle; a range without 0: its middle
-    )
-    signs: FloatArray  # of their axes along y
+    joints: tuple[int, ...]  # pitch joints from hip to foot, indices in the model
+    knee: int  # index in ``joints``
+    rest: FloatArray  # (joints,) [rad] neutral angles
+    spare: FloatArray  # (joints,) [rad] offsets of the other joints: the middle of a range without 0, else 0
+    signs: FloatArray  # (joints,) signs of the axes along y
     places: FloatArray  # (joints, 2) [m] x and z
     sole: FloatArray  # (P, 2) [m] x and z
     level: float  # [rad] rotation of the foot that levels its sole
-    flat: bool  # whether the sole is flat, and the last joint levels it
+    flat: bool  # whether the sole is flat; then the last joint levels it
     straight: float  # [rad] angle of the knee at which the leg is longest
-    folds: tuple[float, ...]  # [rad] how far the knee is bent from there, with its sign; the first is the better way
+    folds: tuple[float, ...]  # [rad] bends of the knee from ``straight``, with sign; the better direction first
     length: float  # [m] of the straight leg
 
 
@@ -89,20 +86,20 @@ class Candidate(NamedTuple):
     name: str
     angles: FloatArray  # (D,) [rad]
     rank: int  # 0 the file's, 1 the maker's, 2 computed, 3 zero
-    height: float | None = None  # [m] of the root, if the pose came with one
-    source: str = ""  # who says so
+    height: float | None = None  # [m] height of the root that belongs to the pose, if any
+    source: str = ""
 
 
 class Judged(NamedTuple):
-    """A candidate with its faults. ``off`` compares two without faults: less is better."""
+    """A candidate with its faults. ``off`` is its error as a crouch: smaller is better."""
 
     candidate: Candidate
     faults: tuple[str, ...]
     off: float
     height: float  # [m] of the root, with the lowest foot on the ground
-    reach: float  # share of the straight leg's length, of the shortest leg
-    margin: float  # [m] of the centre of mass inside of what the feet span; negative: outside
-    sag: float  # [rad] largest of the legs' servos
+    reach: float  # share of the straight leg's length; smallest of the legs
+    margin: float  # [m] from the centre of mass to the edge of the support polygon; negative: outside
+    sag: float  # [rad] largest position error of the legs' servos at rest
 
     @property
     def verdict(self) -> str:
@@ -110,7 +107,7 @@ class Judged(NamedTuple):
 
 
 def judge_poses(robot: RobotModel, feet: Sequence[Sole], maker: Maker | None, keyframe: bool) -> list[Judged]:
-    """All candidates, the chosen one first. ``keyframe``: whether ``robot.pose`` is that of the file's keyframe."""
+    """All candidates, the chosen one first. ``keyframe``: whether ``robot.pose`` is the pose of the file's keyframe."""
     zero = np.clip(np.zeros(len(robot.joint_names)), *robot.joint_range.T)
     neutral = hang_arms(robot, zero, feet)
     feet = [_whole(robot, neutral, foot) for foot in feet]
@@ -129,7 +126,7 @@ def judge_poses(robot: RobotModel, feet: Sequence[Sole], maker: Maker | None, ke
 
 
 def _order(judged: Judged) -> tuple[float, float]:
-    """Without faults the source of a pose counts first; with faults their number, and how far it is off."""
+    """The sort key: source and error of a pose without faults; number of faults and error of a pose with faults."""
     if not judged.faults:
         return judged.candidate.rank, judged.off
     return len(judged.faults), judged.off
@@ -139,7 +136,7 @@ def _order(judged: Judged) -> tuple[float, float]:
 
 
 def find_legs(robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole]) -> list[Leg]:
-    """The legs, one for each foot; none if a foot has fewer than two sideways joints."""
+    """The legs, one per foot. Empty if a leg has fewer than two pitch joints."""
     model = robot.physics
     data = posed(model, neutral)
     points = surfaces(model, data, [geom for foot in feet for geom in foot.geoms])
@@ -155,7 +152,7 @@ def find_legs(robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole]) -> l
 
 
 def _whole(robot: RobotModel, neutral: FloatArray, foot: Sole) -> Sole:
-    """The foot, with all geoms of its body if the leg has an ankle; else a shank may belong to that body."""
+    """The foot, with all geoms of its body if the leg has an ankle. Without one the shank may belong to that body."""
     model = robot.physics
     data, wheels = posed(model, neutral), find_wheels(robot, neutral)
     sideways = [joint for joint in joints_to(model, foot) if _is_sideways(model, data, joint)]
@@ -212,7 +209,7 @@ def _leg(
 
 
 def _lengths(leg: Leg, place: int) -> tuple[FloatArray, FloatArray]:
-    """Angles of the joint at ``place`` in a turn [rad], and the lengths of the leg at them [m]."""
+    """Angles of the joint at index ``place`` over a full turn [rad], and the leg's length at each [m]."""
     angles, lengths = np.linspace(-math.pi, math.pi, 721), []
     for angle in angles:
         turns = leg.spare.copy()
@@ -222,25 +219,25 @@ def _lengths(leg: Leg, place: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _stroke(leg: Leg, place: int, span: FloatArray) -> float:
-    """How much the joint at ``place`` changes the length of the leg within its ``span`` (2,) [rad]."""
+    """The range [m] of the leg's length while the joint at index ``place`` moves over its ``span`` (2,) [rad]."""
     angles, lengths = _lengths(leg, place)
     inside = lengths[(angles >= span[0]) & (angles <= span[1])]
     return float(np.ptp(inside)) if len(inside) else 0.0
 
 
 def _foot_ahead(leg: Leg) -> bool:
-    """Whether the foot of the neutral leg is below or ahead of its knee."""
+    """Whether the foot is below or ahead of the knee in the neutral pose."""
     return float(leg.sole[:, 0].mean() - leg.places[leg.knee, 0]) >= -_BEHIND
 
 
 def _rotate(angle: float, vector: FloatArray) -> FloatArray:
-    """``vector`` (..., 2) of x and z, turned about y by ``angle`` [rad]."""
+    """``vector`` (..., 2) of x and z, rotated about y by ``angle`` [rad]."""
     cos, sin = math.cos(angle), math.sin(angle)
     return vector @ np.array([[cos, -sin], [sin, cos]])
 
 
 def _anchors(leg: Leg, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (joints, 2) of the joints, and rotations (joints,) of what they carry, ``turns`` [rad] from neutral."""
+    """Joint positions (joints, 2) [m] and child link rotations (joints,) [rad] at ``turns`` [rad] from neutral."""
     pitch = np.cumsum(leg.signs * turns)
     places = [leg.places[0]]
     for i in range(1, len(leg.joints)):
@@ -249,7 +246,7 @@ def _anchors(leg: Leg, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _end(leg: Leg, turns: FloatArray) -> FloatArray:
-    """The end of the leg (2,): the last joint above a flat sole, else the middle of the foot."""
+    """The end of the leg (2,) [m]: the last joint if the sole is flat, else the middle of the foot."""
     places, pitch = _anchors(leg, turns)
     if leg.flat:
         return places[-1]
@@ -257,10 +254,10 @@ def _end(leg: Leg, turns: FloatArray) -> FloatArray:
 
 
 def _level(signs: FloatArray, spans: FloatArray, sole: FloatArray) -> tuple[float, float]:
-    """The rotation [rad] of the foot at which most of its sole touches the ground, and the length of that part [m].
+    """The rotation [rad] of the foot at which the longest part of its sole touches the ground, and its length [m].
 
-    Of equally good ones it is the smallest. ``spans`` (joints, 2): how far the joints turn from neutral; the rotation is
-    within what they allow, and within 90 degrees.
+    Of equal rotations, the smallest is returned. ``spans`` (joints, 2) [rad]: ranges of the joints relative to neutral.
+    They limit the rotation, and so does 90 degrees.
     """
     ends = np.sort(signs[:, None] * spans, axis=1).sum(axis=0)
     low, high = max(float(ends[0]), -0.5 * math.pi), min(float(ends[1]), 0.5 * math.pi)
@@ -282,19 +279,19 @@ def _range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
 
 # ---- arms ----
 
-_BESIDE = 0.03  # [m] a joint further from the middle plane belongs to an arm, not to waist or head
-_LIGHT = 0.005  # of the robot's mass: what a joint of a finger carries
-_STAY = 0.01  # [m] of height: what a radian away from 0 costs, so that idle joints stay there
+_BESIDE = 0.03  # [m] a joint farther from the middle plane belongs to an arm, not to waist or head
+_LIGHT = 0.005  # share of the robot's mass; a joint that carries less belongs to a finger
+_STAY = 0.01  # [m/rad] cost of an angle away from 0, so that joints without an effect on the height stay at 0
 
 
 def walking_joints(model: mujoco.MjModel, feet: Sequence[Sole]) -> set[int]:
-    """Places in (D,) of the joints between the root and a foot, without those that carry all feet, a waist's."""
+    """Indices in (D,) of the joints between the root and a foot, without those that carry all feet, as a waist does."""
     legs = [{joint - 1 for joint in joints_to(model, foot)} for foot in feet]
     return set.union(*legs) - (set.intersection(*legs) if len(legs) > 1 else set())
 
 
 def hang_arms(robot: RobotModel, zero: FloatArray, feet: Sequence[Sole]) -> FloatArray:
-    """``zero`` (D,) with the arms as their weight would have them. Waist, head and fingers stay."""
+    """``zero`` (D,) with hanging arms: their centre of mass is lowest. Waist, head and fingers stay."""
     model, angles, total = robot.physics, zero.copy(), float(robot.physics.body_subtreemass[0])
     data, walking = posed(model, zero), walking_joints(model, feet)
     arms = [
@@ -304,7 +301,7 @@ def hang_arms(robot: RobotModel, zero: FloatArray, feet: Sequence[Sole]) -> Floa
         and abs(data.xanchor[joint][1] - data.qpos[1]) > _BESIDE
         and model.body_subtreemass[model.jnt_bodyid[joint]] > _LIGHT * total
     ]
-    for _ in range(2):  # an elbow changes what a shoulder carries
+    for _ in range(2):  # twice, because an elbow moves the centre of mass that a shoulder carries
         for joint in arms:
             low, high = _range(model, joint)
             options = np.unique([zero[joint - 1], *np.linspace(low + _MARGIN, high - _MARGIN, 61)])
@@ -316,7 +313,7 @@ def hang_arms(robot: RobotModel, zero: FloatArray, feet: Sequence[Sole]) -> Floa
 
 
 def _height_of(model: mujoco.MjModel, angles: FloatArray, joint: int, angle: float) -> float:
-    """The height [m] of the centre of mass of what the joint carries, with the joint at ``angle`` [rad]."""
+    """The height [m] of the centre of mass of the links that the joint carries, with the joint at ``angle`` [rad]."""
     trial = angles.copy()
     trial[joint - 1] = angle
     data = posed(model, trial)
@@ -326,11 +323,11 @@ def _height_of(model: mujoco.MjModel, angles: FloatArray, joint: int, angle: flo
 
 # ---- wheels ----
 
-_ROUND = 0.05  # of the radius: how far the rim of a wheel is from a circle
+_ROUND = 0.05  # share of the radius: largest deviation of a wheel from a circle
 
 
 def find_wheels(robot: RobotModel, pose: FloatArray) -> list[str]:
-    """The last joints of limbs that have no range and carry a collider that is round about their axis."""
+    """The names of joints at the end of a limb that have no range and whose collider is round about the axis."""
     model = robot.physics
     data = posed(model, pose)
     found = []
@@ -351,7 +348,7 @@ def _is_round(model: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Seq
     across /= np.linalg.norm(across)
     turns = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)[:, None]
     ways = np.cos(turns) * across + np.sin(turns) * np.cross(axis, across)  # (32, 3)
-    reach = np.zeros(len(ways))  # [m] of the outline in each of these directions
+    reach = np.zeros(len(ways))  # [m] radius of the outline in each direction
     for geom in geoms:
         places, radius = spheres_on(model, geom, SPACING)
         points = data.geom_xpos[geom] + places @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
@@ -363,7 +360,7 @@ def _is_round(model: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Seq
 
 
 def crouches(robot: RobotModel, neutral: FloatArray, legs: Sequence[Leg]) -> list[Candidate]:
-    """Crouches of several depths, with the knees to both sides where they can; feet flat and under the hips."""
+    """Crouches of several depths and both knee directions, if possible. The feet are flat and under the hips."""
     if not legs:
         return []
     found = {}
@@ -380,10 +377,10 @@ def crouches(robot: RobotModel, neutral: FloatArray, legs: Sequence[Leg]) -> lis
 
 
 def _bend(model: mujoco.MjModel, leg: Leg, knee: float) -> FloatArray:
-    """The angles (joints,) of the leg with this angle of its knee [rad]."""
+    """The angles (joints,) [rad] of the leg with its knee at ``knee`` [rad]."""
     turns = leg.spare.copy()
     turns[leg.knee] = _within(model, leg.joints[leg.knee], knee) - leg.rest[leg.knee]
-    # turn the hip until the foot is under it
+    # rotate the hip until the foot is under it
     along = float(_rotate(leg.level, leg.sole - leg.places[-1])[:, 0].mean()) if leg.flat else 0.0
     end = _end(leg, turns) - leg.places[0]
     below = math.sqrt(max(float(end @ end) - along**2, 0.0))
@@ -397,7 +394,7 @@ def _bend(model: mujoco.MjModel, leg: Leg, knee: float) -> FloatArray:
 
 
 def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
-    """The nearest angle within the joint's limits."""
+    """The nearest angle [rad] within the joint's limits, with a margin."""
     if not model.jnt_limited[joint]:
         return float(angle)
     low, high = model.jnt_range[joint]
@@ -405,13 +402,13 @@ def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
     return float(np.clip(angle, low + margin, high - margin))
 
 
-# ---- the judge ----
+# ---- faults ----
 
 
 def judge(
     robot: RobotModel, candidate: Candidate, legs: Sequence[Leg], feet: Sequence[Sole], maker: Maker | None
 ) -> Judged:
-    """The faults of a pose, and how far it is off a good one."""
+    """The faults and figures of a pose."""
     model = robot.physics
     angles = np.clip(candidate.angles, *robot.joint_range.T)
     data = posed(model, angles)
@@ -443,7 +440,7 @@ def judge(
 
 
 def _limits(robot: RobotModel, angles: FloatArray, legs: Sequence[Leg]) -> list[str]:
-    """Joints of legs at their limit, and others beyond it."""
+    """A fault if a leg joint is at its limit or another joint is beyond it."""
     walking = {joint - 1 for leg in legs for joint in leg.joints}
     low, high = robot.joint_range.T
     room = np.minimum(angles - low, high - angles)
@@ -455,7 +452,7 @@ def _limits(robot: RobotModel, angles: FloatArray, legs: Sequence[Leg]) -> list[
 
 
 def _posture(angles: FloatArray, leg: Leg) -> tuple[list[str], float, float]:
-    """The faults of one leg, its share of the straight leg's length, and how far it is off a good crouch."""
+    """The faults of one leg, its reach (share of the straight leg's length), and its error as a crouch."""
     faults, turns = [], angles[np.array(leg.joints) - 1] - leg.rest
     places, pitch = _anchors(leg, turns)
     reach = float(np.linalg.norm(_end(leg, turns) - leg.places[0])) / leg.length
@@ -482,17 +479,16 @@ def _sag(
     maker: Maker | None,
     flat: bool,
 ) -> tuple[float, str]:
-    """The largest sag [rad] of a leg's servo, and its joint.
+    """The largest sag [rad] of a leg's servo (position error at rest), and its joint.
 
-    The servo's stiffness is the maker's, else full effort at 1 rad, as in ``measure.suggest``. ``flat``: the feet have
-    flat soles.
+    The stiffness is the maker's, else full effort at 1 rad, as in ``measure.suggest``. ``flat``: the soles are flat.
     """
     model, names = robot.physics, robot.joint_names
     mujoco.mj_forward(model, data)
     torque, com = data.qfrc_bias.copy(), data.subtree_com[0, :2]
     places = np.array([sole.mean(axis=0) for sole in soles])
     weight = float(model.body_subtreemass[0]) * float(np.linalg.norm(model.opt.gravity))
-    # the forces of the feet balance the weight; what they cannot balance, flat soles do by pressing off their middle
+    # forces at the middles of the feet balance the weight; flat soles shift these points to balance the rest
     balance = np.vstack([np.ones(len(feet)), places[:, :2].T - com[:, None]])
     forces = np.clip(np.linalg.lstsq(balance, np.array([weight, 0.0, 0.0]), rcond=None)[0], 0.0, None)
     forces *= weight / max(float(forces.sum()), 1e-9)
@@ -516,7 +512,7 @@ def _sag(
 
 
 def as_lines(judged: Sequence[Judged]) -> list[str]:
-    """A table of all candidates, the chosen one first, and why the others were not chosen."""
+    """A text table of all candidates, the chosen one first, with the reasons against the others."""
     rows = [("pose", "root [m]", "legs", "com [mm]", "sag [rad]", "")]
     for each in judged:
         numbers = f"{each.height:.3f}", f"{100 * each.reach:.0f} %", f"{1e3 * each.margin:+.0f}", f"{each.sag:.2f}"
@@ -530,7 +526,7 @@ def as_lines(judged: Sequence[Judged]) -> list[str]:
 
 
 def why(chosen: Judged, other: Judged) -> str:
-    """Why ``other`` is the chosen pose, or why it is not."""
+    """The reason why ``other`` is or is not the chosen pose."""
     if other is chosen:
         return "; ".join(["chosen", *chosen.faults])
     if other.faults:

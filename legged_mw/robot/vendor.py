@@ -1,6 +1,6 @@
 """Read a vendor's MJCF or URDF, unedited, as a ``RobotFile``.
 
-``RobotFile.notes`` lists dropped, added and renamed elements. Runs on the host only, without simulation.
+``RobotFile.notes`` lists dropped, added and renamed elements. This module simulates nothing.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from legged_mw.utils.errors import ModelError
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # number of columns in qpos; other joints have one
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_ROUNDING = 1e-9  # of the largest moment of inertia
-_THIN = 1e-3  # a balanced body's thickness squared over its length squared is at least about this [ours]
+_ROUNDING = 1e-9  # share of the largest moment of inertia
+_THIN = 1e-3  # smallest (thickness / length)^2 of a body with corrected inertia, about [ours]
 _ADDED = {  # attributes of defaults that would apply to elements added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
@@ -50,7 +50,7 @@ _OURS = {"geoms": SCENE, "hfields": SCENE, "materials": SCENE, "textures": SCENE
 
 
 def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
-    """Read an MJCF or URDF, and keep its sensors named in ``wanted``. Raises ModelError if it is not a single robot."""
+    """Read an MJCF or URDF and keep the sensors named in ``wanted``. Raises ModelError if it is not one valid robot."""
     if not file.is_file():
         raise ModelError(f"no {kind_of(file)} at {file}")
     where, notes, lost = file.name, list[str](), dict[str, str]()
@@ -76,7 +76,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:
-    """Delete explicit inertias if the file computes all inertias from geoms. Then visuals can be dropped later."""
+    """Delete explicit inertias if the file computes all inertias from geoms. Then visual geoms can be dropped later."""
     kinds = mujoco.mjtInertiaFromGeom
     if spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
         spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
@@ -89,8 +89,8 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
 def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     """Remove the file's actuators. Return joint -> lowest and highest force at the joint [N m].
 
-    First choice is the joint's force range, second an actuator's forcerange times gear, third a motor's ctrlrange times
-    gain and gear.
+    It is the first that exists: the joint's force range; an actuator's forcerange x gear; a motor's ctrlrange x gain x
+    gear.
     """
     limits = joint_limits(spec)
     if actuators := list(spec.actuators):
@@ -105,7 +105,7 @@ def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
 
 
 def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
-    """An actuator's force range at the joint [N m]; None if it has none, or if it depends on the state."""
+    """An actuator's force range at the joint [N m]; None if it has none or the range depends on the state."""
     if is_limited(actuator.forcelimited, actuator.forcerange):
         return actuator.forcerange * actuator.gear[0]
     is_motor = actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
@@ -115,7 +115,7 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
 
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
-    """The keyframe "home", or the only one. All keyframes are removed, because they would not match the new servos."""
+    """Return the keyframe "home", or the only one. Remove all keyframes, because they do not match the new servos."""
     keys, taken = list(spec.keys), None
     chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
     qpos = list(chosen.qpos) if chosen else []
@@ -147,7 +147,7 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
 
 
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
-    """Keep contact sensors and ``wanted`` sensors. The state has the values of all others."""
+    """Drop sensors whose values the state contains. Contact sensors and ``wanted`` sensors stay."""
     kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS.split()}
     if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept and sensor.name not in wanted]:
         notes.append(
@@ -158,7 +158,7 @@ def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]
 
 
 def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
-    """Drop the file's ground, objects, lights, cameras and sky, and constraints between them and the robot."""
+    """Drop the file's ground, objects, lights, cameras and sky, and the constraints between them and the robot."""
     for body in [body for body in spec.worldbody.bodies if not _has_joints(body) and _has_joints(spec.worldbody)]:
         notes.append(f"body '{body.name}' of the world dropped: it has no joint")
         spec.delete(body)
@@ -184,7 +184,7 @@ def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
 
 
 def _drop_spares(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Drop bodies of the world with a joint and no geom beside a robot: Unitree keeps motors' numbers in order by them."""
+    """Drop bodies with a joint but no geom beside the robot. Unitree's files use them to number the motors."""
     spare = [body for body in spec.worldbody.bodies if not body.geoms and not body.bodies]
     if len(spare) == len(spec.worldbody.bodies):
         return
@@ -229,7 +229,7 @@ def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def _forget_defaults(spec: mujoco.MjSpec) -> None:
-    """Reset the main defaults. The file's elements already have them; elements added later need MuJoCo's defaults."""
+    """Reset the main defaults, because elements added later need MuJoCo's. The file's elements keep their values."""
     fresh = mujoco.MjSpec().default
     for kind, names in _ADDED.items():
         for name in names.split():
@@ -260,9 +260,9 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
 
 
 def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Replace inertias that no body can have by the nearest ones that a body can have, and note before and after.
+    """Replace each physically impossible inertia by the nearest possible one, and note both.
 
-    Inertias about an axis of the file that are not positive stay, so that MuJoCo refuses them.
+    An inertia with a diagonal value that is not positive stays, so that MuJoCo refuses it.
     """
     for body in [body for body in spec.bodies if body.explicitinertial]:
         is_full = not np.isnan(body.fullinertia[0])
@@ -286,13 +286,13 @@ def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def _nearest_moments(moments: np.ndarray, thin: float) -> np.ndarray:
-    """The principal moments of inertia (3,) that a body can have and that are nearest to ``moments`` (3,).
+    """The physically possible principal moments of inertia (3,) nearest to ``moments`` (3,).
 
-    Each is the sum of two second moments of the mass along the axes; those are at least ``thin`` of the largest moment.
+    Each is the sum of two second moments of mass along the axes. These are at least ``thin`` x the largest moment.
     """
     sums, least = np.ones((3, 3)) - np.eye(3), thin * moments.max()
     found = []
-    for free in itertools.product((False, True), repeat=3):  # all others are at the bound
+    for free in itertools.product((False, True), repeat=3):  # axes that are not at the lower bound
         second, chosen = np.full(3, least), np.array(free)
         rest = moments - sums[:, ~chosen].sum(axis=1) * least
         second[chosen] = np.linalg.lstsq(sums[:, chosen], rest, rcond=None)[0]
@@ -302,7 +302,7 @@ def _nearest_moments(moments: np.ndarray, thin: float) -> np.ndarray:
 
 
 def _rename_clashes(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Rename elements of the file that clash with our own names."""
+    """Rename elements of the file whose names this package uses."""
     renamed: dict[str, dict[str, str]] = {}
     for kind, ours in _OURS.items():
         taken, new = {thing.name for thing in getattr(spec, kind)}, renamed.setdefault(kind, {})
