@@ -180,7 +180,7 @@ def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
 # ---- two policies on one robot: after a fall the second runs until the robot stands ---------------------------------
 
 
-# [deg] tilt of the robot's z axis above which the second policy starts [ours: a walking policy does not recover from it]
+# [deg] tilt of the robot's z axis above which the second policy starts [ours: a walking policy cannot recover from it]
 FELL = 60.0
 # The robot stands, and the first policy starts, if all three values are below these limits for HOLD [ours]:
 # [deg] tilt; [rad] mean distance of the joints from the first policy's default pose; [rad/s] mean joint speed

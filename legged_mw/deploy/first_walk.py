@@ -384,7 +384,7 @@ class FirstWalk(JointCheck):
         self._compare(name, "N m", torque, share * self._motor_torque, SHARE)
 
     def _compare(self, name: str, unit: str, measured: Any, least: float | Floats, share: float = 0.0) -> None:
-        """Store a value, or one per joint (D,). Allowed difference: ``least`` or ``share`` of the exam's, the larger."""
+        """Store a value, or one per joint (D,). It may differ by ``least`` or by ``share`` of the exam's, the larger."""
         measured = np.atleast_1d(measured)
         self.found[self.at, name] = measured
         exam = measured if self._exam is None else self._exam[self.at, name]

@@ -117,7 +117,7 @@ def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
 
 
 def perform(stage: DeployStage, log: MotorLog, skill: Skill) -> Motion | None:
-    """Run TRIES robots on the skill exam's first ground, the task's own. The record of those that do not fall, or None."""
+    """Run TRIES robots on the first ground of the skill exam. Returns the record of those that do not fall, or None."""
     said, follower = stage.contract.motion, stage.controller.follower
     motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
     robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)

@@ -168,12 +168,12 @@ def _cards(figures: Sequence[Figure]) -> str:
                 else figure.text(figure.value)
             )
             cards.append(
-                f'<div class="card{_pass_class(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>'
+                f'<div class="card{_css(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>'
             )
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
-def _pass_class(figure: Figure) -> str:
+def _css(figure: Figure) -> str:
     return {True: " pass", False: " fail", None: ""}[figure.passes()]
 
 
@@ -183,12 +183,12 @@ def exam_table(
     """A table with one row per figure. Each column after the first also shows its difference to the first."""
     lines = []
     for first, *others in zip(*figures, strict=True):
-        cells = [f'<td><span class="value{_pass_class(first)}">{first.text(first.value)}</span></td>']
+        cells = [f'<td><span class="value{_css(first)}">{first.text(first.value)}</span></td>']
         for other in others:
             gap = "" if other.value is None or first.value is None else f"{other.value - first.value:+.{first.digits}f}"
             gap = gap if gap.strip("+-0.") else ""
             cells.append(
-                f'<td><span class="value{_pass_class(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>'
+                f'<td><span class="value{_css(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>'
             )
         cells.append(f"<td>{first.mark_text()}</td>")
         if peer:

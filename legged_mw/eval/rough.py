@@ -67,7 +67,7 @@ def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
 
 
 def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
-    """Grade ``policy`` in the environment of a prepared task. Returns shares of crossings and falls by kind and level."""
+    """Grade ``policy`` in the environment of a prepared task: the shares of crossings and falls by kind and level."""
     assert env.tiles
     kinds = env.tiles.kinds
     repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds are sorted by kind, column, level

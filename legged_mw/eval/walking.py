@@ -284,7 +284,7 @@ class ExamRules:
         return {"walks": self.walks(result), **peer, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
-        """Whether the policy walks: no falls, errors or offsets within the marks, all pushes of ``push_mark`` survived."""
+        """Whether the policy walks: no falls, errors or offsets within the marks, all ``push_mark`` pushes survived."""
         if result["falls"]:
             return False
         within = all(value <= mark for value, mark in zip(result[self.marks_of], self.marks, strict=True))
@@ -302,15 +302,15 @@ class ExamRules:
             able[f"follow {axis} ({error:.2f} {unit} off; {limit:.2g} are allowed)"] = error <= limit
         can, cannot = ([text for text, value in able.items() if value is wanted] for wanted in (True, False))
         if not cannot:
-            advice = "play.py --eval, the whole exam and the hard one"
+            hint = "play.py --eval, the whole exam and the hard one"
         elif falls:
-            advice = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
+            hint = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
         else:
-            advice = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
+            hint = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
         return [
             f"it can: {'; '.join(can) or 'nothing yet'}",
             f"it cannot: {'; '.join(cannot) or '-'}",
-            f"next: {advice}",
+            f"next: {hint}",
         ]
 
     def beats_peer(self, result: Mapping[str, Any]) -> bool:

@@ -454,7 +454,7 @@ def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
 
 # ---- weights of the pose reward
 
-# a biped with a gait clock: weights of configs/robots/g1.py; arms and waist have the waist's weight, so they move little
+# a biped with a gait clock: weights of configs/robots/g1.py; arms have the waist's weight, so that they move little
 WALKS, ANKLE, HELD, QUIET = 0.02, 0.05, 0.5, 1.0
 # a biped without: 1 / (29 std^2), with mjlab's standard deviations of a walking G1: 0.5, 0.15, 0.15 and 0.1 rad
 UPRIGHT = (0.14, 1.5, 1.5, 3.4)

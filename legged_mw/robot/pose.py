@@ -40,7 +40,7 @@ _FLAT = 0.04  # [m] a flat sole is longer than this
 _THIN = 0.004  # [m] points of a sole up to this far above its lowest point are in its plane
 _PRESSED = 0.015  # [m] points of a sole up to this far above its lowest point touch the ground under the robot's weight
 
-# Limits of the faults; ours. Go2's keyframe has a reach of 0.62 and a height error of 2 cm, B2's folded pose 0.22, 35 cm.
+# Limits of the faults; ours. Go2's keyframe has a reach of 0.62 and a height error of 2 cm; B2's has 0.22 and 35 cm.
 AT_LIMIT = 0.02  # [rad] distance to a joint's limit
 FOLDED, UPRIGHT = 0.45, 0.1  # smallest reach: share of the straight leg's length; smallest bend of a knee [rad]
 TILTED = 0.15  # [rad] tilt of a flat sole

@@ -388,7 +388,7 @@ class Halving:
         return self.log(cell, self.rounds(cell))
 
     def found(self, ranking: Sequence[str]) -> list[tuple[Cell, Run]]:
-        """The runs with a completed round and their number of rounds, in the order of ``places``: best setting first."""
+        """The runs with a completed round and their number of rounds, in the order of the settings in ``ranking``."""
         cells = sorted(self.cells, key=lambda cell: ranking.index(cell.setting))
         return [
             (cell._replace(varied={**cell.varied, "rounds": str(self.rounds(cell))}), find_runs([log.folder])[0])
