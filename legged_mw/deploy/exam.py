@@ -59,15 +59,15 @@ def run_exam(
     """
     contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
-    wanted = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
+    commands = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
-    wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
+    commands[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
     stage = DeployStage(
-        folder, len(wanted), threads=threads, scene_file=scene, ends=ends, contact=contact, edited=edited
+        folder, len(commands), threads=threads, scene_file=scene, ends=ends, contact=contact, edited=edited
     )
     stage.scatter(seed)
-    fell_at = np.full(len(wanted), math.inf)
+    fell_at = np.full(len(commands), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(walking.EXAM_SECONDS / stage.dt)):
         sampled["velocity"].append(stage.velocity())
@@ -75,7 +75,7 @@ def run_exam(
         sampled["power"].append(np.abs(stage.measured.joint_torque * stage.measured.joint_vel).sum(axis=1))
         sampled["joint_speed"].append(np.abs(stage.measured.joint_vel).mean(axis=1))
         _push(stage, exam, step)  # the policy acts on the measurement from before the push
-        stage.step(wanted)
+        stage.step(commands)
         estimate = stage.believed_velocity()  # of the same measurement
         sampled["estimate"] += [] if estimate is None else [estimate]
         fell_at[stage.fell() & np.isinf(fell_at)] = step
@@ -115,8 +115,8 @@ def perform(
     stage = DeployStage(
         folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited
     )
-    said, follower = stage.contract.motion, stage.controller.follower
-    motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
+    source, follower = stage.contract.motion, stage.controller.follower
+    motion = ReferenceMotion(follower.clip.qpos(), source.bodies, source.anchor) if source and follower else None
     robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
     if starts := skill.starts(robot, skill.robots):
         stage.put(*starts)
@@ -220,10 +220,10 @@ class SwitchStage(DeployStage):
             self.reset(int(world))
         tilted = self.contract.ends.tilted(self.measured.gravity)
         self._fell, stood = tilted & ~self.rescued, self._stood(self.measured)
-        back = self.rescued & stood
-        self.rescued = (self.rescued | self._fell) & ~back
+        recovered = self.rescued & stood
+        self.rescued = (self.rescued | self._fell) & ~recovered
         # reset the memory of the policy that does not run
-        self.controller.reset(self.rescued | back)
+        self.controller.reset(self.rescued | recovered)
         self.rescuer.reset(~self.rescued | self._fell)
         self._fell |= broken
 
@@ -244,16 +244,16 @@ class SwitchStage(DeployStage):
 
 def check_same(first: Contract, second: Contract) -> None:
     """Raise UserError if two policies cannot control the same robot."""
-    own = sorted({row.name for row in second.rows if row.measured in OWN} - {row.name for row in first.rows})
-    for what, here, there in (
+    unshared = sorted({row.name for row in second.rows if row.measured in OWN} - {row.name for row in first.rows})
+    for name, value, other_value in (
         ("joints", first.joints, second.joints),
         ("period", first.period, second.period),
         ("stiffness", first.stiffness.tolist(), second.stiffness.tolist()),
         ("damping", first.damping.tolist(), second.damping.tolist()),
         ("motors", first.motors, second.motors),
-        ("rows with sensors of their own", [], own),
+        ("rows with sensors of their own", [], unshared),
     ):
-        if here != there:
+        if value != other_value:
             raise UserError(
-                f"--switch: {what} of {first.task} and {second.task} differ, so they cannot drive one robot: {here} and {there}"
+                f"--switch: {name} of {first.task} and {second.task} differ, so they cannot drive one robot: {value} and {other_value}"
             )

@@ -40,8 +40,8 @@ def run_hard(
     load = hard.load_of(rules, contract.mass)
     conditions = run_conditions(folder, contract, rules, load, edited, scene, seed)
     walk, poses = look(folder, contract, rules, edited, scene, seed)
-    found = hard.looks(walk) if walk else None
-    return hard.finish(rules, walks, conditions, found, len(contract.feet), load), poses
+    figures = hard.looks(walk) if walk else None
+    return hard.finish(rules, walks, conditions, figures, len(contract.feet), load), poses
 
 
 # ---- the conditions -------------------------------------------------------------------------------------------------
@@ -57,33 +57,33 @@ def run_conditions(
     seed: int = 0,
 ) -> dict[str, Any]:
     """Condition -> falls, errors, drift and pushes. Each condition has its own worlds."""
-    asked = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
-    count = len(asked) * len(CONDITIONS)
-    wanted = commands_of(contract, asked * len(CONDITIONS))
+    velocities = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
+    count = len(velocities) * len(CONDITIONS)
+    commands = commands_of(contract, velocities * len(CONDITIONS))
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
     stage = DeployStage(folder, count, ends=ends, scene_file=scene, edited=edited)
     stage.scatter(seed)
-    apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(asked)), load, seed)
+    apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(velocities)), load, seed)
     fell_at, velocity, position = np.full(count, math.inf), [], []
     for step in range(round(hard.SECONDS / stage.dt)):
         velocity.append(stage.velocity())
         position.append(stage.qpos()[:, :2])
-        _push(stage, step, len(asked), hard.push_speed(len(contract.feet)))
-        stage.step(wanted)
+        _push(stage, step, len(velocities), hard.push_speed(len(contract.feet)))
+        stage.step(commands)
         fell_at[stage.fell() & np.isinf(fell_at)] = step
-    speeds, places, results = np.stack(velocity), np.stack(position), {}
+    speeds, positions, results = np.stack(velocity), np.stack(position), {}
     for i, condition in enumerate(CONDITIONS):
-        own = slice(i * len(asked), (i + 1) * len(asked))
-        results[condition.name] = hard.grade_condition(rules, speeds[:, own], places[:, own], fell_at[own], stage.dt)
+        own = slice(i * len(velocities), (i + 1) * len(velocities))
+        results[condition.name] = hard.grade_condition(rules, speeds[:, own], positions[:, own], fell_at[own], stage.dt)
     return results
 
 
 def commands_of(contract: Contract, velocities: Sequence[Sequence[float]]) -> Floats:
     """Commands (N, C): ``velocities`` (N, 3) are vx, vy, yaw rate; other commands have their defaults."""
     names = [command.name for command in contract.commands]
-    wanted = np.tile([command.default for command in contract.commands], (len(velocities), 1))
-    wanted[:, [names.index(name) for name in VELOCITY]] = velocities
-    return wanted
+    commands = np.tile([command.default for command in contract.commands], (len(velocities), 1))
+    commands[:, [names.index(name) for name in VELOCITY]] = velocities
+    return commands
 
 
 def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float, seed: int = 0) -> None:
@@ -136,7 +136,7 @@ def look(
 ) -> tuple[Walk | None, list[Floats]]:
     """Record a walk ahead at half of the highest vx, and the qpos of one stride. None if the robot falls."""
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
-    witness: list[Witness] = []
+    recorder: list[Witness] = []
     stage = DeployStage(
         folder,
         1,
@@ -145,22 +145,22 @@ def look(
         ends=ends,
         change=_solve_well,
         edited=edited,
-        each=lambda: witness[0].sample(),
+        each=lambda: recorder[0].sample(),
     )
-    witness.append(Witness(stage.fleet))  # before scatter, because the feet must be level
+    recorder.append(Witness(stage.fleet))  # before scatter, because the feet must be level
     stage.scatter(seed)
-    wanted = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
-    targets, poses, settled = [], [], round(hard.SETTLING / stage.dt)
+    commands = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
+    targets, poses, settling = [], [], round(hard.SETTLING / stage.dt)
     for step in range(round(LOOK_SECONDS / stage.dt)):
-        stage.step(wanted)
+        stage.step(commands)
         if stage.fell()[0]:
             return None, []
-        if step == settled - 1:
-            witness[0].forget()
-        if step >= settled:
+        if step == settling - 1:
+            recorder[0].forget()
+        if step >= settling:
             targets.append(stage.controller.last_targets[0].copy())
             poses.append(stage.qpos()[0])
-    walk = witness[0].walk(np.array(targets))
+    walk = recorder[0].walk(np.array(targets))
     rate = hard.looks(walk)["strides"] or 1.0
     stride = np.linspace(0.0, min(1.0 / rate / stage.dt, len(poses)), PICTURES, endpoint=False).astype(int)
     return walk, [poses[len(poses) - 1 - stride[-1] + i] for i in stride]
@@ -200,19 +200,19 @@ class Witness:
         self.fleet.read_data(data)
         now.qpos[:] = data.qpos
         mujoco.mj_kinematics(self.model, now)
-        turned = now.xmat[self._bodies].reshape(-1, 3, 3) @ self._level  # (1 + F, 3, 3) rotation since the start
-        up = turned[0].T @ [0.0, 0.0, 1.0]
+        rotation = now.xmat[self._bodies].reshape(-1, 3, 3) @ self._level  # (1 + F, 3, 3) rotation since the start
+        up = rotation[0].T @ [0.0, 0.0, 1.0]
         x, y = now.qpos[:2]
-        heading = math.atan2(turned[0][1, 0], turned[0][0, 0])
-        places = np.array([now.geom_xpos[geoms].mean(axis=0) for geoms in self.feet]).reshape(-1, 3)
-        sideways = math.cos(heading) * (places[:, 1] - y) - math.sin(heading) * (places[:, 0] - x)
+        heading = math.atan2(rotation[0][1, 0], rotation[0][0, 0])
+        positions = np.array([now.geom_xpos[geoms].mean(axis=0) for geoms in self.feet]).reshape(-1, 3)
+        sideways = math.cos(heading) * (positions[:, 1] - y) - math.sin(heading) * (positions[:, 0] - x)
         torque = data.qfrc_actuator[self._dofs] - self._damping * data.qvel[self._dofs]
         self._rows.append(
             {
                 "tilt": np.array([math.atan2(up[1], up[2]), math.atan2(-up[0], up[2])]),
                 "sideways": sideways,
                 "height": np.array([min(lowest_point(self.model, now, geom) for geom in each) for each in self.feet]),
-                "sole": np.arccos(np.clip(turned[1:, 2, 2], -1.0, 1.0)),
+                "sole": np.arccos(np.clip(rotation[1:, 2, 2], -1.0, 1.0)),
                 "force": self._forces(data),
                 "angle": now.qpos[self._angles].copy(),
                 "torque": torque,
@@ -236,9 +236,9 @@ class Witness:
 
     def walk(self, targets: Floats) -> Walk:
         """The record and the policy's ``targets`` (P, D) [rad]."""
-        kept: dict[str, Any] = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
+        record: dict[str, Any] = {name: np.stack([row[name] for row in self._rows]) for name in self._rows[0]}
         if not all(has_sole(self.model, geoms) for geoms in self.feet):
-            kept["sole"] = None
+            record["sole"] = None
         model, contract = self.model, self.fleet.contract
         limited = model.jnt_limited[self._joints] > 0
         low, high = model.jnt_range[self._joints].T
@@ -252,7 +252,7 @@ class Witness:
             limit=torque_limits(model, self._joints),
             joints=contract.joints,
             clock=1.0 / contract.gait.period if contract.gait else None,
-            **kept,
+            **record,
         )
 
 
@@ -285,8 +285,8 @@ def strip_png(folder: Path, contract: Contract, poses: Sequence[Floats]) -> byte
     except ViewError as error:
         print(f"no strip of pictures: {error}")
         return b""
-    with TemporaryDirectory() as place:
-        save_png(path := Path(place) / "strip.png", contact_sheet(frames, PICTURES))
+    with TemporaryDirectory() as temp:
+        save_png(path := Path(temp) / "strip.png", contact_sheet(frames, PICTURES))
         return path.read_bytes()
 
 
@@ -306,15 +306,15 @@ def _frames(model: mujoco.MjModel, poses: Sequence[Floats]) -> list[NDArray[np.u
     data.qpos[:] = poses[0]
     mujoco.mj_forward(model, data)
     robot = np.flatnonzero(model.geom_bodyid)
-    tall = float(data.geom_xpos[robot, 2].max())
-    wide = 2.0 * float(np.linalg.norm(data.geom_xpos[robot, :2] - poses[0][:2], axis=1).max())
+    height = float(data.geom_xpos[robot, 2].max())
+    width = 2.0 * float(np.linalg.norm(data.geom_xpos[robot, :2] - poses[0][:2], axis=1).max())
     frames = []
     for azimuth in VIEWS.values():
         for pose in poses:
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
-            camera.lookat[:] = [pose[0], pose[1], 0.55 * tall]
-            camera.distance, camera.azimuth, camera.elevation = 1.5 * max(tall, wide) + 0.5, azimuth, -8.0
+            camera.lookat[:] = [pose[0], pose[1], 0.55 * height]
+            camera.distance, camera.azimuth, camera.elevation = 1.5 * max(height, width) + 0.5, azimuth, -8.0
             mujoco.mjv_updateCamera(model, data, camera, renderer.scene)
             renderer.update_scene(data, camera, option)
             frames.append(renderer.render())

@@ -77,10 +77,10 @@ class MotorLog:
 
 def walk(stage: DeployStage, log: MotorLog, vx: float, holds: bool) -> tuple[dict[str, Motion | None], Switch | None]:
     """Let the servos hold the default pose (if ``holds``), then let the policy stand, then walk at ``vx`` [m/s]."""
-    stand, ahead = (commands_of(stage.contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
+    stand, forward = (commands_of(stage.contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
     switch = switch_over(stage, log, stage.contract, stand) if holds else None
     motions: dict[str, Motion | None] = {}
-    for name, command in (("standing", stand), ("walking", ahead)):
+    for name, command in (("standing", stand), ("walking", forward)):
         fell = _run(stage, SETTLING, command)
         log.take()
         motions[name] = None if _run(stage, SECONDS - SETTLING, command) or fell else log.take()
@@ -118,14 +118,14 @@ def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
 
 def perform(stage: DeployStage, log: MotorLog, skill: Skill) -> Motion | None:
     """Run TRIES robots on the first ground of the skill exam. Returns the record of those that do not fall, or None."""
-    said, follower = stage.contract.motion, stage.controller.follower
-    motion = ReferenceMotion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
+    source, follower = stage.contract.motion, stage.controller.follower
+    motion = ReferenceMotion(follower.clip.qpos(), source.bodies, source.anchor) if source and follower else None
     robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
     if starts := skill.starts(robot, stage.num_worlds):
         stage.put(*starts)
-    stands = np.ones(stage.num_worlds, dtype=bool)
+    standing = np.ones(stage.num_worlds, dtype=bool)
     for _ in range(skill.steps(robot)):
         stage.step()
-        stands &= ~stage.fell()
+        standing &= ~stage.fell()
     torque, speed = log.take()
-    return Motion(torque[:, stands], speed[:, stands]) if stands.any() else None
+    return Motion(torque[:, standing], speed[:, standing]) if standing.any() else None

@@ -83,10 +83,8 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
     """Two masks (N,): worlds that moved ``edge`` [m] from the middle in x or y, and worlds that fell before."""
-    command = torch.tensor(
-        [SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device
-    )
-    crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
+    command = torch.tensor([SPEED, 0.0, 0.0, *(other.default for other in env.command_table[3:])], device=env.device)
+    crossed, fell, done = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
     env.commands.copy_(command)
     obs = env.first_observations()
     forget(policy)
@@ -95,10 +93,10 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
             actions = policy(obs)
         obs, _, dones, extras = env.step(actions)
         forget(policy, dones)
-        fell |= dones & ~extras["time_outs"] & ~over
-        over |= dones
-        crossed |= (env.max_distance[:, 0] > edge) & ~over
-        over |= crossed
+        fell |= dones & ~extras["time_outs"] & ~done
+        done |= dones
+        crossed |= (env.max_distance[:, 0] > edge) & ~done
+        done |= crossed
         env.commands.copy_(command)  # a reset draws new commands; worlds that were reset do not count
     return crossed, fell
 

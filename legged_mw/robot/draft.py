@@ -119,9 +119,9 @@ def draft(file: Path, simple: bool = False) -> Draft:
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
     if height <= 0.0:
-        ends = ", ".join(foot.name for foot in feet)
+        names = ", ".join(foot.name for foot in feet)
         raise ModelError(
-            f"'{robot.root}', the root, is not above the lowest ends of limbs, {ends}; the health page is of robots that stand on them"
+            f"'{robot.root}', the root, is not above the lowest ends of limbs, {names}; the health page is of robots that stand on them"
         )
     gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [
@@ -135,8 +135,8 @@ def draft(file: Path, simple: bool = False) -> Draft:
     if wheels:
         guessed.append(f"wheels: {', '.join(wheels)}: without a range, and round about their axis")
     # the only site of a robot without a task is its IMU
-    more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
-    notes = [*read.notes, *more]
+    fused = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
+    notes = [*read.notes, *fused]
     return Draft(
         robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles, wheels
     )
@@ -164,16 +164,16 @@ def _servos(
         suggested = zip(names, suggest(joints, moment, firmness), strict=True)
         return [known.get(name, gains) for name, gains in suggested]
 
-    some = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
+    note = f"; of {len(known)} joints its maker's, {maker.source}" if maker and known else ""
     if maker and len(known) == len(names):
         if len(feet) <= 2 or _stands(robot, pose, place, joints, feet, chosen(1.0)):
             return chosen(1.0), f"its maker's, {maker.source}"
-        known, some = {}, f"; with its maker's, {maker.source}, it sinks"
+        known, note = {}, f"; with its maker's, {maker.source}, it sinks"
     for firmness in FIRMNESS if len(feet) > 2 else ():
         if _stands(robot, pose, place, joints, feet, chosen(firmness)):
-            firmer = f"{firmness:g} times what is suggested below, to stand on its servos"
-            return chosen(firmness), ("as suggested below" if firmness == 1.0 else firmer) + some
-    return chosen(1.0), "as suggested below" + some
+            text = f"{firmness:g} times what is suggested below, to stand on its servos"
+            return chosen(firmness), ("as suggested below" if firmness == 1.0 else text) + note
+    return chosen(1.0), "as suggested below" + note
 
 
 def _stands(
@@ -246,10 +246,10 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
         asset["foot_geoms"] = parts
-    if said := {
+    if speeds := {
         name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
     }:
-        asset["joint_speed_limits"] = short_table(said, names)
+        asset["joint_speed_limits"] = short_table(speeds, names)
     if found.held:
         asset["held_joints"] = patterns(found.held, names)
     asset |= _motors(found)
@@ -296,10 +296,10 @@ def _motors(found: Draft) -> dict[str, dict[str, float]]:
     """The maker's armature [kg m^2] and effort [N m] of joints for which the robot's file has none."""
     if not found.maker:
         return {}
-    bare = [joint.name for joint in found.joints if not joint.armature]
-    endless = [joint.name for joint in found.joints if not math.isfinite(joint.effort)]
-    said = {"armature": found.maker.of("armature", bare), "effort": found.maker.of("effort", endless)}
-    return {name: short_table(known, found.robot.joint_names) for name, known in said.items() if known}
+    no_armature = [joint.name for joint in found.joints if not joint.armature]
+    no_effort = [joint.name for joint in found.joints if not math.isfinite(joint.effort)]
+    published = {"armature": found.maker.of("armature", no_armature), "effort": found.maker.of("effort", no_effort)}
+    return {name: short_table(known, found.robot.joint_names) for name, known in published.items() if known}
 
 
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -329,14 +329,14 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 def patterns(held: Sequence[str], moving: Sequence[str]) -> list[str]:
     """Short patterns that match all ``held`` joints and no ``moving`` joint, from the first words of their names."""
-    found = list[str]()
+    result = list[str]()
     for name in held:
         words = family(name)
         options = (f"*{words.partition('_')[0]}*", f"*{words}*", name)
-        fitting = next(each for each in options if not any(fnmatchcase(joint, each) for joint in moving))
-        if not any(fnmatchcase(name, each) for each in found):
-            found.append(fitting)
-    return found
+        pattern = next(each for each in options if not any(fnmatchcase(joint, each) for joint in moving))
+        if not any(fnmatchcase(name, each) for each in result):
+            result.append(pattern)
+    return result
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
@@ -344,16 +344,16 @@ def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
     common = Counter(numbers).most_common(1)[0][0]
     short, exact = {"": common}, dict(zip(names, numbers, strict=True))
     for name, number in exact.items():
-        alike = {other for other, value in exact.items() if family(other) == family(name) and value != number}
-        key = name if alike else family(name)
+        different = {other for other, value in exact.items() if family(other) == family(name) and value != number}
+        key = name if different else family(name)
         if number != common:
             short[key] = number
     return short if _reads(short, names, numbers) else exact
 
 
-def short_table(said: dict[str, float], names: Sequence[str]) -> dict[str, float]:
+def short_table(known: dict[str, float], names: Sequence[str]) -> dict[str, float]:
     """``table`` of ``said`` if it has a value for each of ``names``; else ``said`` itself."""
-    return table([said[name] for name in names], names) if len(said) == len(names) else said
+    return table([known[name] for name in names], names) if len(known) == len(names) else known
 
 
 def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[float]) -> bool:
@@ -394,15 +394,15 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
         raise ModelError(
             "no part that ends a limb collides, so that no feet can be guessed; give the feet colliding geoms"
         )
-    lowest = min(min(these.values()) for these in of_body.values())
+    lowest = min(min(heights.values()) for heights in of_body.values())
     near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
-    soles = {body: _sole(model, these) for body, these in of_body.items() if min(these.values()) <= near}
-    for body, these in of_body.items():  # the foot of a lifted leg is not low
+    soles = {body: _sole(model, heights) for body, heights in of_body.items() if min(heights.values()) <= near}
+    for body, heights in of_body.items():  # the foot of a lifted leg is not low
         same = [
             other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))
         ]
-        if body not in soles and same and len(of_body[same[0]]) == len(these):
-            soles[body] = [geom for geom, like in zip(these, of_body[same[0]], strict=True) if like in soles[same[0]]]
+        if body not in soles and same and len(of_body[same[0]]) == len(heights):
+            soles[body] = [geom for geom, twin in zip(heights, of_body[same[0]], strict=True) if twin in soles[same[0]]]
     return _renamed(robot, [_foot(robot, body, soles[body]) for body in sorted(soles)])
 
 
@@ -443,11 +443,11 @@ def _renamed(robot: RobotModel, feet: Sequence[Foot]) -> list[Foot]:
     for foot in feet:
         owner = robot.physics.body(int(robot.physics.geom(foot.geoms[0]).bodyid[0])).name
         side = [part for part in owner.split("_") if part not in (*family(owner).split("_"), "joint")]
-        plain = re.fullmatch(rf"{re.escape(owner)}_\d+", foot.name) and side
-        new.append(Foot("_".join([*side, "foot"]), foot.geoms, False) if plain else foot)
-    taken = {*robot.names.geoms, *robot.names.bodies, *(foot.name for foot in feet)}
+        generated = re.fullmatch(rf"{re.escape(owner)}_\d+", foot.name) and side
+        new.append(Foot("_".join([*side, "foot"]), foot.geoms, False) if generated else foot)
+    used = {*robot.names.geoms, *robot.names.bodies, *(foot.name for foot in feet)}
     clash = len({foot.name for foot in new}) < len(new) or any(
-        foot.name in taken for foot, old in zip(new, feet, strict=True) if foot is not old
+        foot.name in used for foot, old in zip(new, feet, strict=True) if foot is not old
     )
     return list(feet) if clash else new
 

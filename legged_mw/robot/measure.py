@@ -196,15 +196,15 @@ def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: boo
 def _corners(points: FloatArray) -> FloatArray:
     """The corners (C, 2) of the convex hull of ``points`` (P, 2): Andrew's monotone chain."""
     ordered = np.unique(points, axis=0)
-    found = list[FloatArray]()
+    corners = list[FloatArray]()
     for side in (ordered, ordered[::-1]):
         chain = list[FloatArray]()
         for point in side:
             while len(chain) > 1 and _turn(chain[-2], chain[-1], point) <= 0.0:
                 chain.pop()
             chain.append(point)
-        found += chain[:-1]
-    return np.array(found or [points[0]])
+        corners += chain[:-1]
+    return np.array(corners or [points[0]])
 
 
 def _turn(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
@@ -312,15 +312,15 @@ def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float],
     speed = np.zeros(len(robot.joint_names))
     for step in range(1, round(STAND_SECONDS / control_step) + 1):
         sim.step(decimation)
-        now = step * control_step
+        seconds = step * control_step
         if not np.isfinite(qpos).all() or not np.abs(qvel).max() <= _FAST:
             joints = np.abs(qvel[6:]) if np.isfinite(qvel).all() else speed
-            return Stand(now, "diverges", tuple(robot.joint_names[i] for i in np.argsort(-joints)[:3]))
+            return Stand(seconds, "diverges", tuple(robot.joint_names[i] for i in np.argsort(-joints)[:3]))
         speed = np.abs(qvel[6:]).copy()
         if tilt(qpos[3:7]) > STAND_TILT:
-            return Stand(now, "falls")
+            return Stand(seconds, "falls")
         if qpos[2] < STAND_HEIGHT * place[2]:
-            return Stand(now, "sinks")
+            return Stand(seconds, "sinks")
     return Stand(STAND_SECONDS, "stands")
 
 
@@ -349,11 +349,11 @@ def suggest(joints: Sequence[Joint], moment: float, firmness: float = 1.0) -> li
     effort is unknown, kp is this bound, or the kp of a limb with a natural frequency of 2 Hz if that is larger. kd [N m
     s/rad] is 25 ms x kp. docs/your_own_robot.md compares these gains with published gains.
     """
-    wanted = [firmness * _wanted(joint, moment) for joint in joints]
+    stiffness = [firmness * _wanted(joint, moment) for joint in joints]
     gains = []
     for joint in joints:
-        alike = [i for i, other in enumerate(joints) if family(other.name) == family(joint.name)]
-        kp = _round(max(wanted[i] for i in alike))
+        same_family = [i for i, other in enumerate(joints) if family(other.name) == family(joint.name)]
+        kp = _round(max(stiffness[i] for i in same_family))
         gains.append(Gains(kp, _round(DAMPING_TIME * kp)))
     return gains
 

@@ -116,8 +116,8 @@ def judge_poses(robot: RobotModel, feet: Sequence[Sole], maker: Maker | None, ke
     if keyframe and robot.keyframe is not None:
         candidates.append(Candidate("the file's keyframe", np.array(robot.pose), 0, robot.keyframe.height))
     if maker and maker.pose:
-        said = maker.of("pose", robot.joint_names)
-        angles = [said.get(name, angle) for name, angle in zip(robot.joint_names, neutral, strict=True)]
+        published = maker.of("pose", robot.joint_names)
+        angles = [published.get(name, angle) for name, angle in zip(robot.joint_names, neutral, strict=True)]
         candidates.append(Candidate("its maker's", np.array(angles), 1, source=maker.source))
     candidates += crouches(robot, neutral, legs)
     candidates.append(Candidate("all joints at 0, or at the nearest end of their range", zero, 3))
@@ -182,8 +182,8 @@ def _leg(
 ) -> Leg:
     places, signs = data.xanchor[joints][:, [0, 2]].copy(), np.sign(data.xaxis[joints, 1])
     rest, spans = neutral[np.array(joints) - 1], np.array([_range(model, joint) for joint in joints])
-    level, long = _level(signs, spans - rest[:, None], sole)
-    flat = long > _FLAT and len(joints) > 2
+    level, length = _level(signs, spans - rest[:, None], sole)
+    flat = length > _FLAT and len(joints) > 2
     if flat:
         up = _rotate(level, sole)[:, 1]
         sole = sole[up <= up.min() + _PRESSED]
@@ -265,8 +265,8 @@ def _level(signs: FloatArray, spans: FloatArray, sole: FloatArray) -> tuple[floa
     for angle in sorted(np.linspace(low, high, 181), key=abs):
         turned = _rotate(float(angle), sole)
         touching = turned[turned[:, 1] <= turned[:, 1].min() + _THIN, 0]
-        if (long := float(np.ptp(touching))) > best[1] + 0.002:
-            best = (float(angle), long)
+        if (length := float(np.ptp(touching))) > best[1] + 0.002:
+            best = (float(angle), length)
     return best
 
 
@@ -344,15 +344,15 @@ def find_wheels(robot: RobotModel, pose: FloatArray) -> list[str]:
 def _is_round(model: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Sequence[int]) -> bool:
     """Whether the outline of ``geoms``, seen along the axis of ``joint``, is a circle about it."""
     axis = data.xaxis[joint]
-    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    across /= np.linalg.norm(across)
-    turns = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)[:, None]
-    ways = np.cos(turns) * across + np.sin(turns) * np.cross(axis, across)  # (32, 3)
-    reach = np.zeros(len(ways))  # [m] radius of the outline in each direction
+    normal = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    normal /= np.linalg.norm(normal)
+    angles = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False)[:, None]
+    directions = np.cos(angles) * normal + np.sin(angles) * np.cross(axis, normal)  # (32, 3)
+    reach = np.zeros(len(directions))  # [m] radius of the outline in each direction
     for geom in geoms:
-        places, radius = spheres_on(model, geom, SPACING)
-        points = data.geom_xpos[geom] + places @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
-        reach = np.maximum(reach, (ways @ points.T).max(axis=1) + radius)
+        centers, radius = spheres_on(model, geom, SPACING)
+        points = data.geom_xpos[geom] + centers @ data.geom_xmat[geom].reshape(3, 3).T - data.xanchor[joint]
+        reach = np.maximum(reach, (directions @ points.T).max(axis=1) + radius)
     return bool(reach.min() > (1.0 - _ROUND) * reach.max())
 
 
@@ -363,17 +363,17 @@ def crouches(robot: RobotModel, neutral: FloatArray, legs: Sequence[Leg]) -> lis
     """Crouches of several depths and both knee directions, if possible. The feet are flat and under the hips."""
     if not legs:
         return []
-    found = {}
-    for way in range(max(len(leg.folds) for leg in legs)):
+    by_angles = {}
+    for side in range(max(len(leg.folds) for leg in legs)):
         for depth in DEPTHS:
             angles = neutral.copy()
             for leg in legs:
-                bend = depth * leg.folds[min(way, len(leg.folds) - 1)]
+                bend = depth * leg.folds[min(side, len(leg.folds) - 1)]
                 angles[np.array(leg.joints) - 1] = _bend(robot.physics, leg, leg.straight + bend)
-            middle = round(float(np.mean([abs(leg.folds[0]) for leg in legs])) * depth, 2)
-            name = f"knees bent by {middle:g} rad{', the other way' if way else ''}"
-            found[angles.round(2).tobytes()] = Candidate(name, angles, 2)
-    return list(found.values())
+            mean_bend = round(float(np.mean([abs(leg.folds[0]) for leg in legs])) * depth, 2)
+            name = f"knees bent by {mean_bend:g} rad{', the other way' if side else ''}"
+            by_angles[angles.round(2).tobytes()] = Candidate(name, angles, 2)
+    return list(by_angles.values())
 
 
 def _bend(model: mujoco.MjModel, leg: Leg, knee: float) -> FloatArray:
@@ -417,14 +417,14 @@ def judge(
     soles = [np.concatenate([points[geom] for geom in foot.geoms]) for foot in feet]
     lows = np.array([sole[:, 2].min() for sole in soles])
     size = max((leg.length for leg in legs), default=max(-float(lows.min()), 0.1))
-    down = [sole for sole, low in zip(soles, lows, strict=True) if low <= lows.min() + UNEVEN * size]
-    touching = np.concatenate([sole[sole[:, 2] <= sole[:, 2].min() + _PRESSED] for sole in down])
+    standing = [sole for sole, low in zip(soles, lows, strict=True) if low <= lows.min() + UNEVEN * size]
+    touching = np.concatenate([sole[sole[:, 2] <= sole[:, 2].min() + _PRESSED] for sole in standing])
     margin = inside_by(touching[:, :2], data.subtree_com[0, :2])
     faults = [*_limits(robot, candidate.angles, legs)]
     reach, off = 1.0, 0.0
     for leg in legs:
-        fault, reached, far = _posture(angles, leg)
-        faults, reach, off = [*faults, *fault], min(reach, reached), off + far / len(legs)
+        fault, reached, error = _posture(angles, leg)
+        faults, reach, off = [*faults, *fault], min(reach, reached), off + error / len(legs)
     if candidate.height is not None and abs(candidate.height + lows.min()) > HEIGHT * size:
         faults.append(f"says the root is {candidate.height:.2f} m high, but stands at {-lows.min():.2f} m")
     if (uneven := float(np.ptp(lows))) > UNEVEN * size:
@@ -443,12 +443,12 @@ def _limits(robot: RobotModel, angles: FloatArray, legs: Sequence[Leg]) -> list[
     """A fault if a leg joint is at its limit or another joint is beyond it."""
     walking = {joint - 1 for leg in legs for joint in leg.joints}
     low, high = robot.joint_range.T
-    room = np.minimum(angles - low, high - angles)
-    bad = [i for i in range(len(angles)) if room[i] < (AT_LIMIT if i in walking else -AT_LIMIT)]
+    distance = np.minimum(angles - low, high - angles)
+    bad = [i for i in range(len(angles)) if distance[i] < (AT_LIMIT if i in walking else -AT_LIMIT)]
     if not bad:
         return []
-    some = ", ".join(robot.joint_names[i] for i in bad[:2]) + (f" and {len(bad) - 2} more" if bad[2:] else "")
-    return [f"{some} at the end of the range"]
+    text = ", ".join(robot.joint_names[i] for i in bad[:2]) + (f" and {len(bad) - 2} more" if bad[2:] else "")
+    return [f"{text} at the end of the range"]
 
 
 def _posture(angles: FloatArray, leg: Leg) -> tuple[list[str], float, float]:
@@ -462,13 +462,13 @@ def _posture(angles: FloatArray, leg: Leg) -> tuple[list[str], float, float]:
     if abs(bend) < UPRIGHT:
         faults.append("straight knees")
     middle = places[-1] + _rotate(float(pitch[-1]), leg.sole.mean(axis=0) - leg.places[-1])
-    away = abs(float(middle[0] - leg.places[0, 0])) / leg.length
-    if away > AWAY:
+    offset = abs(float(middle[0] - leg.places[0, 0])) / leg.length
+    if offset > AWAY:
         faults.append("feet not under the hips")
     tilt = abs(math.remainder(float(pitch[-1]) - leg.level, 2.0 * math.pi)) if leg.flat else 0.0
     if tilt > TILTED:
         faults.append(f"soles tilted by {tilt:.2f} rad")
-    return faults, reach, abs(bend - leg.folds[0]) / BEND + away / AWAY + tilt / TILTED
+    return faults, reach, abs(bend - leg.folds[0]) / BEND + offset / AWAY + tilt / TILTED
 
 
 def _sag(
@@ -519,9 +519,9 @@ def as_lines(judged: Sequence[Judged]) -> list[str]:
         rows.append((each.candidate.name, *numbers, why(judged[0], each)))
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     lines = []
-    for name, *numbers, said in rows:
+    for name, *numbers, reason in rows:
         cells = [name.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(numbers, widths[1:], strict=True))]
-        lines.append("  ".join([*cells, said]).rstrip())
+        lines.append("  ".join([*cells, reason]).rstrip())
     return lines
 
 

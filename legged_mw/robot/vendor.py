@@ -67,10 +67,10 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         _free_root(spec, where, notes)
         _balance(spec, notes)
         _rename_clashes(spec, notes)
-        with warnings.catch_warnings(record=True) as said:
+        with warnings.catch_warnings(record=True) as caught:
             model = compile_readable(spec, where, notes, lost)
         check_model(model)
-        notes += [f"warning: {' '.join(str(each.message).split())}" for each in said]
+        notes += [f"warning: {' '.join(str(each.message).split())}" for each in caught]
     _check_joints(spec, where)
     return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors, lost)
 
@@ -116,7 +116,7 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
     """Return the keyframe "home", or the only one. Remove all keyframes, because they do not match the new servos."""
-    keys, taken = list(spec.keys), None
+    keys, keyframe = list(spec.keys), None
     chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
     qpos = list(chosen.qpos) if chosen else []
     starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
@@ -128,22 +128,22 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
         }
         first = next(iter(spec.joints), None)
         free = bool(first and first.type == _FREE)
-        lean = tilt(qpos[3:7]) if free else 0.0
-        taken = Keyframe(chosen.name, qpos[2] if free and lean < UPRIGHT else None, angles)
+        angle = tilt(qpos[3:7]) if free else 0.0
+        keyframe = Keyframe(chosen.name, qpos[2] if free and angle < UPRIGHT else None, angles)
         notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
-        if lean > UPRIGHT:
-            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
+        if angle > UPRIGHT:
+            text = f"warning: keyframe '{chosen.name}' tilts the root by {angle:.0f} degrees; that and its height are not read, the root "
             notes.append(f"{text}begins upright: state a pose for that")
     for key in keys:
         if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")
-        elif not taken:
+        elif not keyframe:
             notes.append(
                 f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
             )
         spec.delete(key)
     spec.nkey = 0
-    return taken
+    return keyframe
 
 
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
@@ -172,12 +172,12 @@ def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
     geoms = list(spec.worldbody.geoms)
     skies = [texture for texture in spec.textures if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
     dropped = {"world geoms": geoms, "lights": list(spec.lights), "cameras": list(spec.cameras), "skybox": skies}
-    for what, things in dropped.items():
-        if things:
-            why = ", as the ground is added" if things is geoms else ""
-            notes.append(f"{what} dropped{why}: {', '.join(thing.name or 'one without a name' for thing in things)}")
-        for thing in things:
-            spec.delete(thing)
+    for kind, parts in dropped.items():
+        if parts:
+            reason = ", as the ground is added" if parts is geoms else ""
+            notes.append(f"{kind} dropped{reason}: {', '.join(part.name or 'one without a name' for part in parts)}")
+        for part in parts:
+            spec.delete(part)
     if geoms or skies:
         _drop_unused(spec)
     _drop_ties(spec, notes)
@@ -203,11 +203,11 @@ def _drop_unused(spec: mujoco.MjSpec) -> None:
     """Delete height fields, materials and textures that only the ground uses."""
     for hfield in [field for field in spec.hfields if field.name not in {geom.hfieldname for geom in spec.geoms}]:
         spec.delete(hfield)
-    worn = {thing.material for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons)}
-    for material in [material for material in spec.materials if material.name not in worn]:
+    used = {thing.material for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons)}
+    for material in [material for material in spec.materials if material.name not in used]:
         spec.delete(material)
-    shown = {name for material in spec.materials for name in material.textures}
-    for texture in [texture for texture in spec.textures if texture.name not in shown]:
+    used_textures = {name for material in spec.materials for name in material.textures}
+    for texture in [texture for texture in spec.textures if texture.name not in used_textures]:
         spec.delete(texture)
 
 
@@ -270,16 +270,16 @@ def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
         if not (min(xx, yy, zz) > 0.0 and np.isfinite([xx, yy, zz, xy, xz, yz]).all()):
             continue
         moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        short = (moments[2] - moments[0] - moments[1]) / moments[2]
-        if short < -_ROUNDING:
+        deficit = (moments[2] - moments[0] - moments[1]) / moments[2]
+        if deficit < -_ROUNDING:
             continue
-        nearest = _nearest_moments(moments, _THIN if short > _ROUNDING else 1e-6)
+        nearest = _nearest_moments(moments, _THIN if deficit > _ROUNDING else 1e-6)
         full = axes @ np.diag(nearest) @ axes.T
         if is_full:
             body.fullinertia = full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         else:
             body.inertia = np.diag(full)
-        if short > _ROUNDING:
+        if deficit > _ROUNDING:
             moments[np.abs(moments) < _ROUNDING * moments[2]] = 0.0
             before, after = (", ".join(f"{moment:.3g}" for moment in each) for each in (moments, nearest))
             notes.append(f"inertia of '{body.name}' balanced: no body has the moments {before} kg m^2; now {after}")
@@ -290,15 +290,15 @@ def _nearest_moments(moments: np.ndarray, thin: float) -> np.ndarray:
 
     Each is the sum of two second moments of mass along the axes. These are at least ``thin`` x the largest moment.
     """
-    sums, least = np.ones((3, 3)) - np.eye(3), thin * moments.max()
-    found = []
+    sums, bound = np.ones((3, 3)) - np.eye(3), thin * moments.max()
+    options = []
     for free in itertools.product((False, True), repeat=3):  # axes that are not at the lower bound
-        second, chosen = np.full(3, least), np.array(free)
-        rest = moments - sums[:, ~chosen].sum(axis=1) * least
+        second, chosen = np.full(3, bound), np.array(free)
+        rest = moments - sums[:, ~chosen].sum(axis=1) * bound
         second[chosen] = np.linalg.lstsq(sums[:, chosen], rest, rcond=None)[0]
-        if second.min() >= least * (1.0 - _ROUNDING):
-            found.append(sums @ second)
-    return min(found, key=lambda each: float(np.linalg.norm(each - moments)))
+        if second.min() >= bound * (1.0 - _ROUNDING):
+            options.append(sums @ second)
+    return min(options, key=lambda each: float(np.linalg.norm(each - moments)))
 
 
 def _rename_clashes(spec: mujoco.MjSpec, notes: list[str]) -> None:
