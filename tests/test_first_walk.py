@@ -130,5 +130,5 @@ def test_the_policy_waits_for_the_emergency_stop(exam: Found) -> None:
 
 def test_a_policy_without_velocity_has_no_first_walk() -> None:
     folder = POLICIES / "go1_getup"
-    with pytest.raises(UserError, match="--first_walk is of a policy that follows lin_vel_x"):
+    with pytest.raises(UserError, match="--first_walk needs a policy that follows lin_vel_x"):
         rehearse(folder, read_contract(folder))

@@ -99,7 +99,7 @@ def test_a_file_of_something_else_is_refused_before_the_exam(spoil: str, tmp_pat
     text = "[]" if spoil == "list" else json.dumps(said)
     (file := tmp_path / "stored.json").write_text(text[: len(text) // 2] if spoil == "cut" else text)
     with pytest.raises(
-        UserError, match={"cut": "cut short", "list": "no result", "robot": "joints", "version": "version"}[spoil]
+        UserError, match={"cut": "incomplete", "list": "not a result", "robot": "joints", "version": "version"}[spoil]
     ):
         exam(GO2, "--no_hard", "--against", file)
 

@@ -201,7 +201,7 @@ def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
     assert row[0].count('class="value pass"') == 2 and row[0].count('class="value fail"') == 1
     assert "<small>+0.004</small>" in row[0] and ">0.568<" in row[0] and ">fell<" in html
     assert (
-        "asked: vx -1.5 to 1.5 m/s, vy -0.8 to 0.8 m/s, yaw rate -1.2 to 1.2 rad/s. A command at which the robot falls counts"
+        "asked: vx -1.5 to 1.5 m/s, vy -0.8 to 0.8 m/s, yaw rate -1.2 to 1.2 rad/s. If the robot falls, the error of this command"
         in html
     )
     assert "Published policies" not in html
@@ -278,8 +278,8 @@ def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...
         drawn.append("".join(plots.svgs(sections["tracking"]._replace(panels=sections["tracking"].panels[:1]))))
     assert ">0.06</text>" in drawn[1] and ">0.06</text>" not in drawn[0]
     html = report.walking_page("biped", asked, [Column("mine", {}, graded, figures)], [(sections["tracking"], [])])
-    assert "The stroke on each scale" not in html and "vx offset" in html and "of the mean velocity" in html
-    assert "The stroke on each scale" in report.walking_page(
+    assert "The mark on each scale" not in html and "vx offset" in html and "of the mean velocity" in html
+    assert "The mark on each scale" in report.walking_page(
         "go1", GO1, [Column("mine", {}, result, figures)], [(sections["tracking"], [])]
     )
     assert ">2 fell</text>" in "".join(plots.svgs(sections["steps"]._replace(panels=sections["steps"].panels[:1])))

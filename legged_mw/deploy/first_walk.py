@@ -119,7 +119,7 @@ class FirstWalk(JointCheck):
         super().__init__(controller, sources, say, robot, limits)
         contract = controller.contract
         if not {*VELOCITY} <= {each.name for each in contract.commands}:
-            raise UserError(f"--first_walk is of a policy that follows {', '.join(VELOCITY)}; {contract.task} does not")
+            raise UserError(f"--first_walk needs a policy that follows {', '.join(VELOCITY)}; {contract.task} does not")
         self._robot, self._exam, self._odometry = robot, exam, Odometry(controller.folder, contract, 1, "torque")
         self.values, self.found = list[Value](), dict[tuple[str, str], Floats]()
         self.at, self.wants, self.ended = HANGING, "", ""  # step; next button; why the walk ended
@@ -175,10 +175,10 @@ class FirstWalk(JointCheck):
         measured = yield Order(ZERO)
         measured = yield from self._hangs(measured)
         measured = yield from self._joints(measured)
-        measured = yield from self._get_up(measured, "lower it until its feet carry it, the rope slack")
+        measured = yield from self._get_up(measured, "lower the robot until its feet carry it and the rope is slack")
         measured = yield from self._stands(measured)
         measured = yield from self._stops(measured)
-        measured = yield from self._get_up(measured, "once more")
+        measured = yield from self._get_up(measured, "lower the robot again")
         measured = yield from self._on_the_spot(measured)
         yield from self._a_metre(measured)
 
@@ -186,7 +186,7 @@ class FirstWalk(JointCheck):
         """The robot hangs at zero torque. Compare its tilt, and the distance of joint angles to their range."""
         while self._now < CALM:
             measured = yield Order(ZERO)
-        self._want(START, f"{START}: joint check, if it hangs with its feet in the air")
+        self._want(START, f"{START}: joint check, if the robot hangs with its feet in the air")
         while START not in self._pressed:
             measured = yield Order(ZERO)
         angles = measured.joint_pos
@@ -199,7 +199,7 @@ class FirstWalk(JointCheck):
     def _joints(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
         """Run the joint check. Its verdict can also end the walk."""
         self.at = JOINTS
-        self._want("", f"each joint moves a little; {END} if another one moves than the one that is named", CHECK)
+        self._want("", f"each joint moves a little; press {END} if the named joint is not the one that moves", CHECK)
         yield from self._check(measured)
         self._say(super().report)
         if wrong := [f"{self.joints[row.joint]}: {row.verdict}" for row in self.rows if row.verdict != "right"]:
@@ -449,5 +449,5 @@ def rehearse(folder: Path, contract: Contract) -> Mapping[tuple[str, str], Float
     """The measured values of the exam's robot. Raises UserError if it does not complete all steps."""
     walk = first_walk(MujocoRobot(folder, contract, whole=True, hoisted=True, lift=LIFT), folder, contract)
     if not walk.right:
-        raise UserError(f"the exam's robot itself does not do it:{walk.report.replace(chr(10), ' ')}; see --eval first")
+        raise UserError(f"the exam's robot does not complete it:{walk.report.replace(chr(10), ' ')}; run --eval first")
     return walk.found

@@ -41,20 +41,20 @@ Export = Callable[[str, int, Path], None]  # run's name, checkpoint's iteration 
 
 def parse() -> argparse.Namespace:
     parser = Parser(prog="legged-mw exam", description=__doc__, allow_abbrev=False)
-    what = "an export, a run, TASK/RUN, or a task for its last run; several: trainings that count as repeats"
+    what = "an export, a run, TASK/RUN, or a task (its last run); several policies count as repeats"
     parser.add_argument("policies", metavar="POLICY", nargs="+", help=what)
     parser.add_argument("--against", metavar="FILE", help="a result to compare with; exit code 1 if a mark fell")
-    parser.add_argument("--json", metavar="FILE", help="where the result goes")
-    parser.add_argument("--badge", metavar="FILE", help="an SVG that says whether it walks")
-    seeds = f"repeats, each with its own starts and noise (default: {SEEDS})"
+    parser.add_argument("--json", metavar="FILE", help="write the result to this file")
+    parser.add_argument("--badge", metavar="FILE", help="write the verdict as an SVG badge to this file")
+    seeds = f"number of repeats, each with its own start states and noise (default: {SEEDS})"
     parser.add_argument("--seeds", type=positive, default=SEEDS, metavar="N", help=seeds)
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="the first seed; 0 starts without scatter")
-    parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="of a run (default: the newest)")
-    common = "of a walk: the ranges that were trained, or those that published policies of the robot were asked"
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="the first seed; 0: no random start states")
+    parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="a run's checkpoint (default: newest)")
+    common = "walking exam: the trained command ranges, or the common range of the robot's published policies"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--scene", metavar="FILE", help="of a walk: in this MJCF of yours, such as a vendor's own")
-    parser.add_argument("--no_hard", action="store_true", help="without the hard exam, in half of the time")
-    parser.add_argument("--edited", action="store_true", help="a contract that was changed, or written by hand")
+    parser.add_argument("--scene", metavar="FILE", help="walking exam: an MJCF of the robot, such as the vendor's")
+    parser.add_argument("--no_hard", action="store_true", help="skip the hard exam, which takes half of the time")
+    parser.add_argument("--edited", action="store_true", help="accept a contract that was changed or written by hand")
     args = parser.parse_args()
     if args.seed < 0:
         parser.error(f"--seed {args.seed}: a seed is 0 or more")
@@ -125,7 +125,7 @@ def asked_of(folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     section = dict(contract.exam or {})
     if "kind" in section:
         if flag := "--ranges" if args.ranges else "--scene" if args.scene else "":
-            raise UserError(f"{flag} is of the walking exam, and {folder} has another one: leave it out")
+            raise UserError(f"{flag} is for the walking exam, but {folder} has another exam: leave it out")
         exam = {"kind": section["kind"], "rules": vars(contract_skill(contract))}
     else:
         rules = contract_rules(contract, args.ranges == "common")
@@ -144,7 +144,7 @@ def check_alike(request: Mapping[str, Any], other: Mapping[str, Any], name: str,
                 key = next(key for key in {**value, **other_value} if value.get(key) != other_value.get(key))
                 path, value, other_value = (*path, key), value.get(key), other_value.get(key)
             difference = f"{': '.join(path)} is {_short(value)} of {name} and {_short(other_value)} of {against}"
-            raise UserError(f"{difference}: one exam of one robot is compared; write a new result with --json FILE")
+            raise UserError(f"{difference}: exam and robot must be the same; write a new result with --json FILE")
 
 
 def _short(value: Any) -> str:
@@ -289,7 +289,7 @@ def read_result(file: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"--against {shown(file)}: {error.strerror}; {advice}") from None
     except (ValueError, RecursionError) as error:
-        raise UserError(f"--against {shown(file)}: it is cut short, or no JSON ({error}); {advice}") from None
+        raise UserError(f"--against {shown(file)}: it is incomplete or not JSON ({error}); {advice}") from None
     try:
         names = [each["name"] for each in result["marks"]]
         numbers = [each[key] for each in result["marks"] for key in ("mean", "tolerance", "digits")]
@@ -298,7 +298,7 @@ def read_result(file: Path) -> dict[str, Any]:
     except (LookupError, TypeError):
         valid = False
     if not valid:
-        raise UserError(f"--against {shown(file)}: no result of this program; {advice}")
+        raise UserError(f"--against {shown(file)}: it is not a result of this program; {advice}")
     return result
 
 

@@ -20,39 +20,39 @@ if TYPE_CHECKING:
 
 CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 TEXTS = {
-    "hard": "{count} commands of 6 s and {pushes} pushes from all sides under each condition alone, then all of them: 10 ms, gains x 0.9, "
-    "load, friction 0.5, noise. Below: how it looks while it walks at {vx:g} m/s, with the marks of ready for a robot.",
-    "heat": "One robot in MuJoCo's C engine: held in its default pose, then by the policy standing, then walking at half of the highest "
-    "speed; a skill as in its exam. What nobody published of the motors and the battery is unknown (docs/heat.md).",
-    "crossing": "Commanded ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
-    "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
-    "ground; below it stands what makes it hard, level by level. Dark is good.",
-    "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
-    "range that was trained. Dark is good. {stroke}A cross is a fall.",
-    "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
-    "robots, each in another phase of its gait at the step; band: lowest and highest of them. One that fell is not among them.",
-    "estimate": "What the policy believes of its velocity, body frame at the IMU, beside what the simulator knows: the last "
-    "two seconds of each command, side by side. The exam's table has the root mean square of the difference over the last 8 of 10 seconds.",
-    "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the duty factor: "
-    "the share of time that a foot is down, mean over the feet.",
-    "joints": "Where the joints are, how fast they move and what torque they need over all commands without a fall. Upright strokes are "
-    "limits: soft position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond "
-    "a limit (of a torque: at 98 % of it or more), where there are any.",
-    "motors": "Torque against speed of each kind of joint over all commands without a fall: the more often, the darker. The lines are the "
-    "motor's envelope: its force limit, and its torque-speed curve if control.actuator has one. Above: the share of samples at the "
-    "envelope, by 2 % of the highest torque.",
-    "pushes": "The base's horizontal velocity jumps; a push is survived if the robot has not fallen three seconds later. Rings: jumps "
-    "of {speeds} m/s, from the inside; sectors: where it is pushed to. Coloured tiles were survived. Walking is at {vx:g} m/s; the exam "
-    "counts these.",
-    "energy": "Straight ahead and backwards. Power: sum over the joints of |torque x speed|. Cost of transport: energy over weight "
-    "times distance.",
-    "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the commands without a fall.",
+    "hard": "The robot follows {count} commands of 6 s and is pushed in {pushes} directions, under each condition alone, then under all: "
+    "10 ms delay, gains x 0.9, load, friction 0.5, noise. The second table measures the gait at {vx:g} m/s.",
+    "heat": "One robot in MuJoCo's C engine holds its default pose, then the policy stands, then it walks at half of the highest speed. A "
+    "skill runs as in its exam. Unpublished values of the motors and the battery are unknown (docs/heat.md).",
+    "crossing": "The command is 0.6 m/s ahead, from the middle of a tile, with a random heading. The first number is the share of ten "
+    "robots on two tiles that reached the edge of their tile within 15 s. The number below is the share that fell. The others did not "
+    "reach the edge. A row is a kind of ground, with its measure of difficulty for each level. Dark is good.",
+    "tracking": "Mean absolute error of the base velocity at the IMU, body frame, over the last 8 of 10 seconds, for commands over the "
+    "trained range. Dark is good. {stroke}A cross is a fall.",
+    "steps": "The command is two thirds of the trained range, then the same backwards, then zero, then ahead again. The line is the mean "
+    "of eight robots, whose gait phases differ at the step. The band is their range. Robots that fell are left out.",
+    "estimate": "The velocity estimate of the policy and the true velocity, body frame at the IMU, in the last two seconds of each "
+    "command. The exam's table has the root mean square of the difference over the last 8 of 10 seconds.",
+    "gait": "A bar is a foot in contact, in the last two seconds of each command. The numbers above are the stride frequency [1/s] and the "
+    "duty factor: the share of time in contact, mean over the feet.",
+    "joints": "Joint positions, velocities and torques over all commands without a fall. Vertical lines are limits: soft "
+    "position limits, the motors' speed limits, the servos' torque limits. The number at the right is the share of samples beyond a limit "
+    "(of a torque: at 98 % of the limit or more), if there are any.",
+    "motors": "Torque and speed of each kind of joint over all commands without a fall. Darker points are more frequent. The lines are the "
+    "motor's envelope: its force limit, and its torque-speed curve if control.actuator has one. The number above is the share of samples "
+    "at the envelope, to within 2 % of the highest torque.",
+    "pushes": "A push changes the base's horizontal velocity at once. The robot survives it if it does not fall within three seconds. "
+    "Rings are push speeds, {speeds} m/s from the inside; sectors are push directions. Coloured tiles were survived. The exam counts "
+    "the pushes while walking at {vx:g} m/s.",
+    "energy": "Walking ahead and backwards. Power is the sum of |torque x speed| over the joints. Cost of transport is energy / (weight x "
+    "distance).",
+    "reward": "The reward of each term per second, before the clip at zero, mean over the commands without a fall.",
 }
 EXAM_NOTE = (
-    "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise; {asked}. A command at which the robot falls "
-    "counts with the error of standing still. A policy walks if it passes every row that has a mark. {peer}"
+    "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise; {asked}. If the robot falls, the error of this "
+    "command is that of a robot that stands still. A policy walks if it passes every row that has a mark. {peer}"
 )
-STROKE = "The stroke on each scale is what the exam allows on average. "
+STROKE = "The mark on each scale is the largest mean error that the exam allows. "
 
 
 class Column(NamedTuple):
@@ -226,7 +226,7 @@ def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
         shares = ", ".join(f"{100 * share:.0f}" for share in result["pushes"].values())
         cells.append([name, str(result["falls"]), *triples, drift, cost, shares, vx])
     pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
-    lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
+    lead = f"All policies had the same commands. Cost of transport, and pushes of {pushes} m/s: at the vx of the last column [m/s]."
     return (
         f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{table(heads, cells)}</section>'
     )

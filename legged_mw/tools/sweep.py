@@ -111,24 +111,24 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     about, _, more = (__doc__ or "").partition("\n\n")
     parser = Parser(prog="legged-mw sweep", description=f"{about} {more}", allow_abbrev=False)
     parser.add_argument("--task", metavar="NAME", required=True, help="a task, or the path of a config file")
-    parser.add_argument("--seeds", metavar="N,N,...", default="", help="seeds, each a training")
+    parser.add_argument("--seeds", metavar="N,N,...", default="", help="seeds, one training each")
     parser.add_argument(
         "--set", action="append", default=[], metavar="PATH=V,V,...", help="a config field and its values"
     )
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trainings at a time (default: 1)")
-    parser.add_argument("--halve", action="store_true", help="drop settings early; --max_time is the first round's")
-    rounds = "with --halve: the last round (default: that of the last setting alone)"
+    parser.add_argument("--halve", action="store_true", help="stop bad settings early; --max_time is for round 1")
+    rounds = "with --halve: number of rounds (default: until one setting is left and has trained alone)"
     parser.add_argument("--rounds", type=positive, metavar="N", help=rounds)
-    lines = "start nothing, print the command lines, as for a cluster; with --halve those of the next round"
+    lines = "print the command lines, as for a cluster, and start nothing; with --halve those of the next round"
     parser.add_argument("--print", action="store_true", help=lines)
     args, rest = parser.parse_known_args()
     for flag in ("--run_name", "--resume", "--load_run", "--list", "--check", "--play"):
         if _given(flag, rest):
-            parser.error(f"{flag} is of one training: leave it out")
+            parser.error(f"{flag} is for a single training: leave it out")
     if not all(re.fullmatch(r"\d+", seed) for seed in values(args.seeds)):
         parser.error(f"--seeds {args.seeds}: write whole numbers apart by commas: --seeds 1,2,3")
     if args.rounds and not args.halve:
-        parser.error("--rounds is of --halve: add --halve, or leave --rounds out")
+        parser.error("--rounds needs --halve: add --halve, or leave --rounds out")
     for flag, field in (("--init", "warm_start.policy"), ("--teacher", "distillation.teacher")):
         if args.halve and _given(flag, rest):
             parser.error(f"--halve resumes its trainings, which {flag} does not: write it as --set {field}=RUN")
@@ -420,7 +420,7 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
         exams = {name: [halving.log(cell, number).exam for cell in ready if cell.setting == name] for name in left}
         failed |= any(halving.rounds(cell) < number for cell in ready)
         if not any(exam for each in exams.values() for exam in each):
-            raise UserError(f"round {number}: no training has an exam; what they said is in {shown(halving.folder)}")
+            raise UserError(f"round {number}: no training has an exam; their output is in {shown(halving.folder)}")
         ranked = rank(exams, better)
         ranking = [*ranked, *(name for name in ranking if name not in ranked)]
         if len(left) == 1 or number == args.rounds:
@@ -439,7 +439,7 @@ def halve(halving: Halving, args: argparse.Namespace, stop: Stop) -> None:
     play_flags = shlex.join(["--task", args.task, "--load_run", rank(runs, better)[0]])
     print(f"best: {ranking[0]}; watch it with\n  {command('play')} {play_flags}", file=out)
     if failed:
-        print(f"some failed: what they said is in {shown(halving.folder)}; without --print they train again", file=out)
+        print(f"some failed: their output is in {shown(halving.folder)}; without --print they train again", file=out)
         raise SystemExit(1)
 
 
