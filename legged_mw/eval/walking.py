@@ -1,7 +1,7 @@
 """The commands, measures, pass marks and verdicts of the walking exam. This module imports no torch and no warp.
 
-``rollout`` runs the exam in the training environment, ``legged_mw.deploy`` runs it on an exported policy. A push sets
-the base's velocity at once.
+``rollout`` runs the exam in the training environment, ``legged_mw.deploy`` runs it on an exported policy. A push adds
+to the base's velocity at once.
 """
 
 from __future__ import annotations
