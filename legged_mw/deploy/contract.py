@@ -1,6 +1,6 @@
-"""The contract of an exported policy: ``policy.yaml``, checked against the network and the scene beside it.
+"""The contract of an exported policy: ``policy.yaml``. It is checked against the network and the scene beside it.
 
-The export writes it from here, and ``legged_mw.deploy`` reads it. This module steps no physics and runs no network.
+The export writes it with this module, and ``legged_mw.deploy`` reads it. This module steps no physics and no policy.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ from legged_mw.utils.motor_network import (
 
 
 MOST = 1e6  # upper bound of any quantity of a robot, in any unit
-MOST_VALUES = 10_000_000  # upper bound of an observation's values; a camera picture has a tenth
+MOST_VALUES = 10_000_000  # upper bound of an observation's values; a camera picture has 10 % of it
 
 
 class ContractError(UserError, ValueError):
-    """An export that cannot be deployed. The text names the file, the value, the expected value and what to do."""
+    """The export cannot be deployed. The text names the file, the value, the expected value and what to do."""
 
 
 class Reader:
-    """Takes typed values out of a mapping. A missing or ill-typed value raises one clear line."""
+    """Reads typed values from a mapping. A missing or ill-typed value raises ContractError with one line."""
 
     def __init__(self, values: Mapping[str, Any], where: str) -> None:
         self.values, self.where = values, where
 
     def take(self, key: str, wanted: str, fits: Callable[[Any], bool]) -> Any:
-        """The value of ``key`` if it fits. ``wanted`` describes a value that fits."""
+        """The value of ``key``. Raises ContractError unless it ``fits``. ``wanted`` describes a valid value."""
         if key not in self.values or not fits(self.values[key]):
             found = f"is {brief(self.values[key])}" if key in self.values else "is missing"
             raise ContractError(f"{self.where}: '{key}' {found}; it must be {wanted}")
@@ -94,12 +94,12 @@ class Reader:
         return np.array(value, dtype=float)
 
     def file(self, key: str, name: str) -> None:
-        """Check a file name: an export's files have fixed names and lie beside the contract."""
+        """Check a file name. The files of an export have fixed names and are beside the contract."""
         if key in self.values:
             self.take(key, f"{name}, which lies beside {self.where.partition(':')[0]}", lambda v: v == name)
 
     def scale(self, count: int, of: str) -> np.ndarray:
-        """``scale``, one number a value. The file may give one number for all."""
+        """The value of ``scale``: one number per value. The file may give one number for all."""
         wanted = f"a number, or {count} numbers, one a {of}"
         value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
         self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
@@ -119,7 +119,7 @@ def compile_scene(file: Path) -> Any:
 
 
 def is_number(value: object) -> bool:
-    # an int may be too large for a float
+    # an int can be too large for a float
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
@@ -127,22 +127,22 @@ def is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> 
     return isinstance(value, list) and (empty or len(value) > 0) and all(map(fits, value))
 
 
-# ---- the action -----------------------------------------------------------------------------------------------------
+# ---- action ---------------------------------------------------------------------------------------------------------
 
 
 ORIGINS = ("default", "joints", "targets", "torque", "speed")
 _LARGEST = 1000.0  # legged_gym clips at 100
-_BEYOND = 1e-3  # [rad] that rounding may put a pose beyond its range
+_BEYOND = 1e-3  # [rad] tolerance of a pose beyond its range, for rounding
 
 
 class Action(NamedTuple):
-    """Meaning of an action: joint target = origin + scale * action [rad].
+    """The meaning of an action: joint target [rad] = origin + scale * action.
 
-    Or torque [N m] = scale * action, or speed [rad/s] = scale * action.
-    Limits check the target before it is clipped, and the origin "targets" adds to it. The servo gets the clipped one.
+    With the origins "torque" and "speed": torque [N m] or speed [rad/s] = scale * action.
+    The limits and the origin "targets" use the target before clipping. The servo gets the clipped target.
     """
 
-    # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": none
+    # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": zero
     origin: str
     scale: np.ndarray  # (D,) [rad], [N m] or [rad/s]
     clip: float  # [-] largest |action|
@@ -161,12 +161,12 @@ class Action(NamedTuple):
 
 
 def short(values: Sequence[Any]) -> Any:
-    """One number if all are equal, else the list."""
+    """One number if all values are equal, else the list."""
     return values[0] if len(set(values)) == 1 else list(values)
 
 
 def read_action(action: Reader, joints: Sequence[str], scene: Path | None) -> Action:
-    """Read the section ``action``. ``scene`` gives the range if the contract is too old to state it."""
+    """Read the section ``action``. ``scene`` gives the range of the targets for formats before 5."""
     origin, count = action.take("origin", f"one of {', '.join(ORIGINS)}", lambda v: v in ORIGINS), len(joints)
     scale = action.scale(count, "joint")
     action.take("scale", "other than 0, which moves nothing", lambda _: bool(scale.any()))
@@ -179,7 +179,7 @@ def read_action(action: Reader, joints: Sequence[str], scene: Path | None) -> Ac
 
 
 def target_range(model: mujoco.MjModel, actuators: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest target (D,) of these motors; -MOST and MOST without a limit."""
+    """Lowest and highest target (D,) of the motors ``actuators``; -MOST and MOST without a limit."""
     held, ranges = model.actuator_ctrllimited[list(actuators), None] > 0, model.actuator_ctrlrange[list(actuators)]
     lowest, highest = np.where(held, ranges, [-MOST, MOST]).T
     return lowest, highest
@@ -199,7 +199,7 @@ def _range_of_scene(scene: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.
 
 
 def check_pose(action: Action, joints: Sequence[str], pose: np.ndarray) -> None:
-    """Raise ContractError if ``pose`` (D,) [rad] is beyond the range."""
+    """Raise ContractError if ``pose`` (D,) [rad] is beyond the range of the targets."""
     for joint in np.flatnonzero((pose < action.lowest - _BEYOND) | (pose > action.highest + _BEYOND)).tolist():
         raise ContractError(
             f"policy.yaml: default_pose of {joints[joint]} is {pose[joint]:g} rad, beyond the range of its targets, "
@@ -207,7 +207,7 @@ def check_pose(action: Action, joints: Sequence[str], pose: np.ndarray) -> None:
         )
 
 
-# ---- what the policy estimates --------------------------------------------------------------------------------------
+# ---- estimate -------------------------------------------------------------------------------------------------------
 
 
 ESTIMATE = "estimate"  # name of the network's output, and of the contract's section with its rows
@@ -231,7 +231,7 @@ def read_estimated(rows: Sequence[Any]) -> tuple[Estimated, ...]:
 
 
 def columns_of(rows: Sequence[Estimated], name: str) -> slice | None:
-    """Columns of the row ``name`` in the estimate; None without such a row."""
+    """Columns of the row ``name`` in the estimate; None if there is no such row."""
     start = 0
     for row in rows:
         if row.name == name:
@@ -240,21 +240,21 @@ def columns_of(rows: Sequence[Estimated], name: str) -> slice | None:
     return None
 
 
-# ---- the memory of a recurrent network ------------------------------------------------------------------------------
+# ---- memory of a recurrent network ----------------------------------------------------------------------------------
 
 
 MEMORY = "memory"  # subsection of `network` in the contract
 
 
 class NetworkMemory(NamedTuple):
-    """Memory of a recurrent network: an output, (batch, *shape), that is an input of the next step; zeros at first."""
+    """Memory of a recurrent network: an output (batch, *shape) that is an input of the next step. It starts at zero."""
 
     input: str
     output: str
-    shape: tuple[int, ...]  # layers, values each; for an LSTM h of all layers, then c of all layers
+    shape: tuple[int, ...]  # states, values per state; for an LSTM h of all layers, then c of all layers
 
     def start(self, count: int) -> NDArray[np.float32]:
-        """The memory of ``count`` robots at their start: zeros."""
+        """The memory of ``count`` robots at the start: zeros."""
         return np.zeros((count, *self.shape), dtype=np.float32)
 
     def to_dict(self) -> dict[str, Any]:
@@ -271,10 +271,10 @@ def read_memory(section: Reader) -> NetworkMemory:
     return NetworkMemory(section.text("input"), section.text("output"), tuple(shape))
 
 
-# ---- the motion that a policy follows -------------------------------------------------------------------------------
+# ---- reference motion -----------------------------------------------------------------------------------------------
 
 
-MOTION, MOTION_FILE = "motion", "motion.npz"  # the contract's section; its file, in the format of legged_mw.skills.clip
+MOTION, MOTION_FILE = "motion", "motion.npz"  # section; file, in the format of legged_mw.skills.clip
 JOINT_POS, JOINT_VEL, PLACE, TURN = "reference_joint_pos", "reference_joint_vel", "anchor_pos", "anchor_ori"
 REFERENCE = (JOINT_POS, JOINT_VEL, PLACE, TURN)  # rows that the controller computes from the motion
 # in Measurement.others: attitude (4,) w x y z and position (3,) [m] of the root, world frame
@@ -282,10 +282,10 @@ ATTITUDE, POSITION = "attitude", "position"
 
 
 class FollowedMotion(NamedTuple):
-    """The motion that the policy follows: its anchor body and the tracked bodies."""
+    """The reference motion of a policy: its file, its anchor body and the tracked bodies."""
 
     anchor: str
-    bodies: tuple[str, ...]  # compared with the motion in training
+    bodies: tuple[str, ...]  # tracked in training
     digest: str  # SHA-256 of MOTION_FILE
 
     def to_dict(self) -> dict[str, Any]:
@@ -315,7 +315,7 @@ _ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {
 
 
 class Motors(NamedTuple):
-    """The law from joint target to torque in simulation. A real robot has its own motors."""
+    """The motors in simulation: the law from joint target to torque. A real robot does not use it."""
 
     law: str = "servo"
     stall_torque: tuple[float, ...] = ()  # (D,) [N m] at the joint; empty: no torque-speed curve
@@ -333,7 +333,7 @@ class Motors(NamedTuple):
         return {MOTORS: {"law": self.law, **curve, **network}} if self.law != "servo" else {}
 
     def gains(self, model: mujoco.MjModel, actuators: list[int], dofs: np.ndarray) -> dict[str, np.ndarray]:
-        """Gains and torque-speed curve of ``model``, (D,) each, by the contract's names."""
+        """Gains and torque-speed curve of ``model``: name in the contract -> (D,)."""
         prm = model.actuator_gainprm[actuators]
         found = {}
         if self.law == "servo":
@@ -346,7 +346,7 @@ class Motors(NamedTuple):
         return found
 
     def limp(self, batch: Any) -> None:
-        """Switch off the motors of ``batch`` (not servos). Only damping is left, if they have any."""
+        """Switch off the motors of ``batch``, which are not servos. DC motors keep their damping."""
         if self.law == "dc_motor":
             batch.expand("actuator_gainprm")[:, :, DC_STIFFNESS] = 0.0
         else:
@@ -358,13 +358,13 @@ RATINGS = "ratings"
 
 
 def make_ratings(tables: Mapping[str, Sequence[float | None]], battery_power: float | None, joints: int) -> Ratings:
-    """Ratings from lists (D,), None where unknown; a table that is left out is unknown."""
+    """Ratings from lists (D,). None is an unknown value; a missing table is unknown."""
     full = {name: np.array(tables.get(name, [None] * joints), dtype=float) for name in TABLES}
     return Ratings(**full, battery_power=math.nan if battery_power is None else battery_power)
 
 
 def read_ratings(section: Reader, joints: int) -> Ratings:
-    """Read the section ``ratings``: of each table a number for all motors, or one a joint, null where unknown."""
+    """Read the section ``ratings``. Each table has one number for all motors or one per joint; null: unknown."""
     for name in section.values:
         if name not in Ratings._fields:
             raise ContractError(f"{section.where}: {unknown('rating', name, Ratings._fields, RATINGS)}")
@@ -377,7 +377,7 @@ def read_ratings(section: Reader, joints: int) -> Ratings:
 
 
 def ratings_to_dict(ratings: Ratings) -> dict[str, Any]:
-    """The section ``ratings``: what is known, one number where all motors have the same; empty if nothing is."""
+    """The section ``ratings``: the known ratings, one number if equal for all motors. Empty if none is known."""
     known = {name: values for name in TABLES if not np.isnan(values := getattr(ratings, name)).all()}
     lists = {name: [None if math.isnan(value) else value for value in known[name].tolist()] for name in known}
     battery = {} if math.isnan(ratings.battery_power) else {BATTERY: ratings.battery_power}
@@ -405,7 +405,7 @@ def read_motors(section: Reader, joints: int) -> Motors:
 
 
 def make_network(folder: Path, motors: Motors, count: int, joints: int) -> NetworkMotors | None:
-    """Network motors of ``count`` robots; None for another law. Raises ContractError or UserError."""
+    """The network motors of ``count`` robots; None for another law. Raises ContractError or UserError."""
     if motors.law != "network":
         return None
     if not (folder / MOTORS_FILE).is_file():
@@ -424,16 +424,16 @@ class NetworkMotors:
         self.network = network
         # scaled errors and speeds, newest first
         self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)
-        # h and c of each layer
+        # per layer: h and c
         self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]
 
     def reset(self, which: Any = slice(None)) -> None:
-        """Start the robots ``which`` (indices or a mask) again, with zero errors and speeds in the past."""
+        """Set the history and the memory of the robots ``which`` (indices or a mask) to zero."""
         for memory in (self._past, *self._memory):
             memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
 
     def torque(self, error: NDArray[Any], speed: NDArray[Any]) -> Floats:
-        """Torques (N, D) [N m] from target minus angle [rad] and speed [rad/s], (N, D) each."""
+        """Torques (N, D) [N m] from ``error`` (target minus angle) [rad] and ``speed`` [rad/s], (N, D) each."""
         net, past = self.network, self._past
         past[1:] = past[:-1].copy()
         past[0] = net.error_scale * error, net.speed_scale * speed
@@ -459,9 +459,9 @@ FORMATS = (
     3,
     4,
     5,
-)  # 5 adds the range of targets and the scenes' checksums; older ones take the range from the scene
+)  # 5 adds the range of targets and the scenes' checksums; for older formats the scene gives the range
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
-TERRAIN_FILE = "terrain.mjz"  # the same robot on steps and blocks; only of policies trained on such ground
+TERRAIN_FILE = "terrain.mjz"  # scene with steps and blocks; only for policies trained on such ground
 
 
 class Quantity(NamedTuple):
@@ -472,7 +472,7 @@ class Quantity(NamedTuple):
     frame: str
 
 
-# Observation rows that a task may use by name. Any other row names its sensors: Row(..., sensors=, unit=).
+# Observation rows that a task can use by name. Any other row names its sensors: Row(..., sensors=, unit=).
 ROWS: dict[str, Quantity] = {
     "base_lin_vel": Quantity("lin_vel", "m/s", "body, at the IMU"),
     "base_ang_vel": Quantity("ang_vel", "rad/s", "body"),
@@ -498,14 +498,14 @@ ROWS: dict[str, Quantity] = {
 }
 # computed by the controller; a robot measures all others
 COMPUTED = ("joint_offset", "last_action", "command", "gait_clock", *REFERENCE)
-# Quantities of the scene's sensors. "up" is the world's z axis in the IMU's frame, opposite to gravity.
+# Quantities that the scene's sensors measure. "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque")
-FALL = "fall_contact"  # ground contacts of the geoms in `ends: falls_on`; only with such geoms
+FALL = "fall_contact"  # ground contacts of the geoms in `ends: falls_on`; absent without such geoms
 SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the scene
 SCAN = "height_scan"  # ContractRow.measured of the height scan
 CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
-OWN = (SENSORS, SCAN, "")  # rows that Measurement.others holds whole, by name
-_FARTHEST = 100.0  # [rad] or [m] largest default of a joint, either sign
+OWN = (SENSORS, SCAN, "")  # rows that Measurement.others holds by name
+_FARTHEST = 100.0  # [rad] or [m] largest absolute value of a joint's default angle or of a height
 
 
 @dataclass(frozen=True)
@@ -516,26 +516,26 @@ class ContractRow:
     size: int
     unit: str
     frame: str
-    noise: float  # half width of the uniform noise in training, in `unit`
+    noise: float  # half range of the uniform noise in training, in `unit`
     measured: str  # a field of robot.Measurement, one of COMPUTED, "sensors", or "" if the task does not state it
     sensors: tuple[str, ...] = ()
-    scale: tuple[float, ...] = (1.0,)  # one a value, or one for all: the network sees scale * value
-    history: int = 1  # frames; after a reset all are equal to the first
+    scale: tuple[float, ...] = (1.0,)  # one per value, or one for all; the network's input is scale * value
+    history: int = 1  # number of frames; at a reset the first frame fills all
 
 
 class Ends(NamedTuple):
-    """The falls that end a walk; unset rules end nothing."""
+    """The rules for a fall, which ends a walk. A rule that is not set has no effect."""
 
-    max_tilt: float | None = None  # [deg] between the robot's z axis and the vertical
-    # [m] of the root above the ground; checked in simulation, not on a real robot
+    max_tilt: float | None = None  # [deg] angle between the robot's z axis and the vertical
+    # [m] height of the root above the ground; checked in simulation only
     min_base_height: float | None = None
     falls_on: tuple[str, ...] = ()  # geoms that must not touch the ground; checked in simulation only
-    not_covered: tuple[str, ...] = ()  # the task's own methods that ended episodes in training; not checked here
+    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training; not checked here
 
     def tilted(self, gravity: np.ndarray) -> np.ndarray:
-        """True if ``gravity`` (..., 3), its direction in the body frame, means a fall; also for NaN.
+        """True if ``gravity`` (..., 3), its direction in the body frame, means a fall or is NaN.
 
-        The limit of the robot itself is ``Safety._tilt``.
+        ``Safety._tilt`` checks the robot's own limit.
         """
         if self.max_tilt is None:
             return np.zeros(gravity.shape[:-1], dtype=bool)
@@ -543,7 +543,7 @@ class Ends(NamedTuple):
 
 
 class HeightScan(NamedTuple):
-    """The grid of a height scan: each x times each y [m] from the root, ahead and to the left."""
+    """The grid of a height scan: all pairs of x ahead of the root and y to its left [m]."""
 
     x: tuple[float, ...]
     y: tuple[float, ...]
@@ -551,16 +551,16 @@ class HeightScan(NamedTuple):
 
 
 class Gait(NamedTuple):
-    """A gait clock. It starts at 0 with a command to move and rests at 0 with a command to stand."""
+    """A gait clock. It starts at phase 0 with a command to move and stays at 0 with a command to stand."""
 
     period: float  # [s]
     offsets: tuple[float, ...]  # (F,) phase of each foot, share of the period
-    min_command: float  # norm of (vx, vy, yaw rate) up to which a command means stand
+    min_command: float  # largest norm of (vx, vy, yaw rate) of a command to stand
 
 
 @dataclass(frozen=True)
 class Contract:
-    """The agreement of a robot and a policy; D joints, F feet, C commands. Joints are in the order of ``joints``."""
+    """The interface of a robot and a policy; D joints, F feet, C commands. Joints are in the order of ``joints``."""
 
     task: str
     joints: tuple[str, ...]
@@ -574,7 +574,7 @@ class Contract:
     commands: tuple[Command, ...]  # as trained; empty for a task without commands
     rows: tuple[ContractRow, ...]
     sensors: dict[str, tuple[str, ...]]  # quantity -> sensors of the scene
-    feet: dict[str, tuple[str, ...]]  # foot -> its contact sensors: the foot is on the ground if one of them is
+    feet: dict[str, tuple[str, ...]]  # foot -> its contact sensors; one of them in contact: the foot is on the ground
     ends: Ends
     imu: str
     mass: float  # [kg] of the whole robot
@@ -586,10 +586,10 @@ class Contract:
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
     safety: Mapping[str, Any] | None = None  # limits by name that replace the defaults of safety.Limits
     memory: NetworkMemory | None = None  # of a recurrent network
-    estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
+    estimate: tuple[Estimated, ...] = ()  # rows of the network's second output
     motors: Motors = SERVOS
-    ratings: Ratings | None = None  # what the motors and the battery bear; None: the contract does not say
-    motion: FollowedMotion | None = None  # of a policy that follows one
+    ratings: Ratings | None = None  # of the motors and the battery; None: unknown
+    motion: FollowedMotion | None = None  # the reference motion, if the policy follows one
     scene: str = ""  # SHA-256 of the scene's file; empty in formats before 5
     terrain: str = ""  # SHA-256 of the scene with steps, if there is one
 
@@ -663,8 +663,8 @@ def _row_to_dict(row: ContractRow) -> dict[str, Any]:
 def read_contract(folder: Path, edited: bool = False) -> Contract:
     """Read the contract in ``folder`` and check it against the network and the scenes beside it.
 
-    ``edited``: accept changed values that the network was trained with; see ``edits``.
-    Raises ContractError (or ConfigError, if the YAML is broken) with one line.
+    ``edited``: accept changes of values that training used; see ``edits``.
+    Raises ContractError, or ConfigError for invalid YAML.
     """
     finish_moving(folder)
     contract = _read(Reader(said := load_yaml(part(folder, CONTRACT_FILE)), CONTRACT_FILE), folder)
@@ -698,7 +698,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
 
 
 def part(folder: Path, name: str) -> Path:
-    """Path of a file of the export in ``folder``. Raises ContractError if it is missing."""
+    """The path of the file ``name`` of the export in ``folder``. Raises ContractError if it is missing."""
     if not (folder / name).is_file():
         raise ContractError(
             f"no {name} in {folder}; make an export with: python play.py --task <task> --export {folder}"
@@ -707,7 +707,7 @@ def part(folder: Path, name: str) -> Path:
 
 
 def edits(folder: Path) -> list[str]:
-    """A line for each changed number of the export in ``folder``, with the exported one, and for each changed file."""
+    """One line for each changed value of the export in ``folder``, with the exported value, and per changed file."""
     lines = changes(load_yaml(part(folder, CONTRACT_FILE)))
     files = _changed_files(folder, read_contract(folder, edited=True))
     return [f"{CONTRACT_FILE}: {line}" for line in lines] + [
@@ -776,7 +776,7 @@ def _read(top: Reader, folder: Path) -> Contract:
 
 
 def _read_scenes(physics: Reader, version: int) -> dict[str, Any]:
-    """Checksums of the scenes."""
+    """Read the checksums of the scenes."""
     physics.file("file", SCENE_FILE)
     if version < 5:
         return {}
@@ -810,7 +810,7 @@ def _read_row(row: Reader) -> ContractRow:
 
 
 def _read_ends(ends: Reader) -> Ends:
-    """Read the section ``ends``. A misspelt rule would end nothing, so it is an error."""
+    """Read the section ``ends``. Raises ContractError for an unknown rule."""
     for name in ends.values:
         if name not in Ends._fields:
             raise ContractError(f"{ends.where}: {unknown('rule', name, Ends._fields, 'the rules that end a walk')}")
@@ -825,7 +825,7 @@ def _read_ends(ends: Reader) -> Ends:
 
 
 def _read_scan(top: Reader) -> HeightScan | None:
-    """The grid of the height scan, if a row is one."""
+    """Read the grid of the height scan; None if no row needs it."""
     if not any(row.values.get("measured") == SCAN for row in top.sections("observation")):
         return None
     scan = top.section(SCAN)
@@ -834,7 +834,7 @@ def _read_scan(top: Reader) -> HeightScan | None:
 
 
 def _read_gait(top: Reader) -> Gait | None:
-    """The gait clock, if a row is one."""
+    """Read the gait clock; None if no row needs it."""
     if not any(row.values.get("measured") == CLOCK for row in top.sections("observation")):
         return None
     gait, names = top.section("gait"), [command.values.get("name") for command in top.sections("commands", empty=True)]
@@ -851,7 +851,7 @@ def _read_gait(top: Reader) -> Gait | None:
 
 
 def quantity_size(contract: Contract, name: str) -> int:
-    """Number of values of a measured or computed quantity."""
+    """The number of values of a measured or computed quantity."""
     per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action", JOINT_POS, JOINT_VEL)
     scan = len(contract.scan.x) * len(contract.scan.y) if contract.scan else 0
     counts = {
@@ -864,7 +864,7 @@ def quantity_size(contract: Contract, name: str) -> int:
 
 
 def _check_rows(contract: Contract) -> None:
-    """Check that every row can be measured and has the right size, and that `falls_on` geoms have contact sensors."""
+    """Check that every row can be measured and has the right size. Check that `falls_on` geoms have contact sensors."""
     felt = [name.removeprefix("contact/") for name in contract.sensors.get(FALL, ())]
     for name in contract.ends.falls_on if felt else ():
         if name not in felt:
@@ -891,26 +891,26 @@ def _check_rows(contract: Contract) -> None:
             raise ContractError(f"{where} has size {row.size}; {row.measured} has {right} values on this robot")
 
 
-# ---- the checksum of a contract -------------------------------------------------------------------------------------
+# ---- checksum of a contract -----------------------------------------------------------------------------------------
 #
-# Over all values that belong to the training. The contract carries a copy of those values as exported, from which the
-# list of values changed since is made: no other file of an export has all of them.
+# It covers all values that training used. The contract holds a copy of the exported values, because no other file of
+# an export has all of them. `changes` compares the contract with this copy.
 
 
-CHECKSUM = "checksum"  # of the values that must not change without the network
+CHECKSUM = "checksum"  # of the values that training used
 EXPORTED = "exported"  # those values at the export: base64 of zlib of JSON
-# sections that may change: how the policy is graded and supervised, and what is known of the robot's motors
+# sections that may change: grading, supervision, and ratings of the motors
 FREE = ("task", "ends", "exam", "safety", RATINGS)
-_MOST_TEXT = 1 << 22  # [byte] limit of the unpacked `exported`; a G1's has a four-hundredth
+_MOST_TEXT = 1 << 22  # [byte] limit of the unpacked `exported`; that of G1 has 0.25 % of it
 
 
 def checksum(said: Mapping[str, Any]) -> str:
-    """SHA-256 of the contract's values that belong to the training: joints, rows, scales and so on, in their order."""
+    """SHA-256 of the contract's values that training used (joints, rows, scales ...), in their order."""
     return hashlib.sha256(_bound(said).encode()).hexdigest()
 
 
 def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
-    """The contract with both lines, `checksum` and `exported`."""
+    """The contract's content with the lines `exported` and `checksum` added."""
     text = _bound({**said, EXPORTED: ""}).encode()
     return {
         **said,
@@ -920,7 +920,7 @@ def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def changes(said: Mapping[str, Any]) -> list[str]:
-    """A line for each value that differs from the exported one, with both values."""
+    """One line for each value that differs from the exported value, with both values."""
     if EXPORTED not in said and said.get(CHECKSUM) == checksum(said):  # formats before 5 have no copy
         return []
     try:
@@ -936,13 +936,13 @@ def changes(said: Mapping[str, Any]) -> list[str]:
 
 
 def _bound(said: Mapping[str, Any]) -> str:
-    # formats before 5 have no copy, and `format` was not part of the checksum
+    # formats before 5 have no copy, and their checksum does not cover `format`
     free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in said else ["format"]))
     return json.dumps({name: value for name, value in said.items() if name not in free}, default=str, skipkeys=True)
 
 
 def _values(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Each value in nested mappings and lists, with its place, e.g. observation[3].scale."""
+    """Each value in nested mappings and lists with its path, e.g. observation[3].scale."""
     if isinstance(tree, dict) and tree:
         for name, value in tree.items():
             yield from _values(value, f"{place}.{name}" if place else str(name))

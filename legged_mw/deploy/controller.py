@@ -1,4 +1,4 @@
-"""The controller of an exported policy: measurement and command in, servo targets out. No robot, no clock."""
+"""The controller of an exported policy. It computes servo targets from a measurement and a command."""
 
 from __future__ import annotations
 
@@ -43,24 +43,24 @@ from legged_mw.utils.errors import UserError
 Floats = NDArray[np.floating[Any]]
 Doubles = NDArray[np.float64]
 
-# ---- the gait clock -------------------------------------------------------------------------------------------------
+# ---- gait clock -----------------------------------------------------------------------------------------------------
 
 
 class GaitPhase:
-    """Gait clocks of ``count`` robots with F feet. Each ``keep`` advances them by the contract's period."""
+    """Gait clocks of ``count`` robots with F feet. ``keep`` advances them by the contract's period."""
 
     def __init__(self, contract: Contract, count: int) -> None:
-        """``contract`` has a section ``gait``."""
+        """``contract`` must have a section ``gait``."""
         assert contract.gait
         self._gait, self._share = contract.gait, contract.period / contract.gait.period
         names = [command.name for command in contract.commands]
         self._velocity = [names.index(name) for name in VELOCITY]
-        self.phase: Floats = np.zeros(count)  # (N,) share of the gait period, in the last step
-        self.running: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # (N,) likewise: true if the command was to move
-        self.start: Floats = np.zeros(count)  # (N,) phase at a robot's first step, if it is commanded to move
+        self.phase: Floats = np.zeros(count)  # (N,) phase in the last step, share of the gait period
+        self.running: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # (N,) true if the last command was to move
+        self.start: Floats = np.zeros(count)  # (N,) phase at a robot's first step, if its command is to move
 
     def row(self, commands: Floats, fresh: NDArray[np.bool_]) -> Floats:
-        """Sine of each foot's phase, then cosine (N, 2F); zeros at rest. ``fresh`` (N,): robots at their first step."""
+        """(N, 2F) sine of each foot's phase, then cosine; zero at rest. ``fresh`` (N,): robots at their first step."""
         phase, running = self._next(commands, fresh)
         angle = 2.0 * math.pi * (phase[:, None] + np.array(self._gait.offsets))
         return np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * running[:, None]
@@ -70,24 +70,24 @@ class GaitPhase:
         self.phase, self.running = self._next(commands, fresh)
 
     def _next(self, commands: Floats, fresh: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
-        """Phase (N,) in the coming step, and whether the clock runs (N,)."""
+        """The phase (N,) in the next step, and whether the clock runs (N,)."""
         velocity = np.atleast_2d(commands)[:, self._velocity]
         running = np.broadcast_to((velocity**2).sum(axis=1) > self._gait.min_command**2, self.running.shape)
         phase = np.where(fresh, self.start, np.where(self.running, (self.phase + self._share) % 1.0, 0.0))
         return np.where(running, phase, 0.0), running.copy()
 
 
-# ---- the motion that is followed ------------------------------------------------------------------------------------
+# ---- reference motion -----------------------------------------------------------------------------------------------
 
 
 class Follower:
-    """The motion phase of ``count`` robots: the frame to reach in the coming step. The last frame is held.
+    """The reference frames of ``count`` robots: the frame to reach in the next step. The last frame is held.
 
-    A real robot does not know its place in the world. At its first step the motion is moved and turned to the robot.
+    A real robot does not know its world position. The motion is moved and turned to the robot at its first step.
     """
 
     def __init__(self, folder: Path, contract: Contract, count: int) -> None:
-        """Load the file that ``contract.motion`` names. Raises ContractError for another file."""
+        """Load the reference motion. Raises ContractError if it is not the file of ``contract.motion``."""
         assert contract.motion
         file = folder / MOTION_FILE
         if not file.is_file() or digest(file) != contract.motion.digest:
@@ -104,7 +104,8 @@ class Follower:
         place, turn = self._anchors(self.clip.root_pos, self.clip.root_quat, self.clip.joint_pos)
         self._place, self._turn = np.concatenate([place, place[-1:]]), np.concatenate([turn, turn[-1:]])
         self.frame = np.ones(count, dtype=int)
-        self.start: NDArray[np.int64] | None = None  # (N,) these frames instead, in the world frame, as in training
+        # (N,) frames that replace ``frame``, in the world frame, as in training
+        self.start: NDArray[np.int64] | None = None
         self._shift, self._heading = np.zeros((count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
 
     def rows(self, measured: Measurement, fresh: NDArray[np.bool_]) -> dict[str, Doubles]:
@@ -123,11 +124,11 @@ class Follower:
         self.frame = np.minimum(self._now() + 1, len(self._place) - 1)
 
     def reset(self, which: Any) -> None:
-        """Put the robots ``which`` back to the first frame."""
+        """Set the robots ``which`` to the first frame."""
         self.frame[which] = 1
 
     def ghost(self) -> Doubles:
-        """The coming frames (N, nq) of the scene, moved and turned as the motion is."""
+        """The next reference frames (N, nq) in the scene, moved and turned to the robots."""
         frame = np.minimum(self._now(), len(self.clip.root_pos) - 1)
         states = np.zeros((len(frame), self._model.nq))
         states[:, :3] = _rotate(self._heading, self.clip.root_pos[frame]) + self._shift
@@ -141,7 +142,7 @@ class Follower:
         return np.minimum(self.frame if self.start is None else self.start, len(self._place) - 1)
 
     def _measured(self, measured: Measurement) -> tuple[Doubles, Doubles]:
-        """Place (N, 3) and attitude (N, 4) of the anchor, from the measured root and joint angles."""
+        """Position (N, 3) and attitude (N, 4) of the anchor, from the measured root and joint angles."""
         attitude = np.atleast_2d(measured.others[ATTITUDE])
         root = np.atleast_2d(measured.others.get(POSITION, np.zeros((len(attitude), 3))))
         return self._anchors(root, attitude, np.atleast_2d(measured.joint_pos))
@@ -155,7 +156,7 @@ class Follower:
         return place, turn
 
     def _moved(self, place: Doubles, turn: Doubles, fresh: NDArray[np.bool_]) -> tuple[Doubles, Doubles]:
-        """Shift (N, 3) and turn (N, 4) of the motion; for ``fresh`` robots to their own place and heading."""
+        """Shift (N, 3) and rotation (N, 4) of the motion. They move it to ``fresh`` robots' position and heading."""
         if self.start is not None:
             return self._shift, self._heading
         before = self._now() - 1
@@ -177,14 +178,14 @@ def _matrix(q: Doubles) -> Doubles:
     return matrices.reshape(-1, 3, 3)
 
 
-_FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # of the first call; robot networks need a thousandth of either
+_FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # [s], [byte] limits of the first call; robot networks need 0.1 % of them
 
 
 class Network:
-    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32.
+    """Runs ``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32.
 
     A recurrent network also takes its memory, (N, *shape) of ``contract.memory``, and returns it after the actions.
-    ``estimate`` (N, E) belongs to the last call.
+    ``estimate`` (N, E) is the estimate of the last call.
     """
 
     def __init__(self, folder: Path, contract: Contract) -> None:
@@ -194,7 +195,7 @@ class Network:
         except ImportError:
             raise UserError("running an exported policy needs onnxruntime: pip install onnxruntime") from None
         options, self._run = onnxruntime.SessionOptions(), onnxruntime.RunOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a second thread slows a network this small
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a second thread slows a small network
         options.log_severity_level = self._run.log_severity_level = 4
         network = (folder / NETWORK_FILE).read_bytes()
         self._session = self._first(
@@ -237,7 +238,7 @@ class Network:
                 )
 
     def _check(self, contract: Contract) -> bool:
-        """Compare inputs and outputs with the contract. Returns True if the batch is fixed to 1."""
+        """Compare inputs and outputs with the contract. Returns True if the batch size is fixed to 1."""
         names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
         guessed = "".join(f", {row.name} {row.size}" for row in contract.estimate)
         for what, ports, shapes, why in (
@@ -270,18 +271,18 @@ class Network:
 
 
 class Controller:
-    """Runs a policy on ``count`` robots: observations and joint targets as the contract states, with their memory."""
+    """Runs a policy on ``count`` robots. It computes observations and joint targets as the contract states."""
 
     def __init__(
         self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None
     ) -> None:
-        """``network`` replaces the one in ``folder``; see ``Network``."""
+        """``network`` replaces the network in ``folder``; see ``Network``."""
         self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
         self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
-        # (N, D) [rad] before they are clipped to the servos' range
+        # (N, D) [rad] before clipping to the servos' range
         self.last_targets = np.tile(contract.default_pose, (count, 1))
-        # frames of the last observation, a row each
+        # per row: (N, history, size) frames of the last observation
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]
         self._fresh = np.ones(count, dtype=bool)  # (N,) robots without an observation since their reset
         self.clock = GaitPhase(contract, count) if contract.gait else None
@@ -296,7 +297,7 @@ class Controller:
         """Joint targets (N, D) [rad], or torques [N m], for the next period.
 
         ``commands`` (N, C) in the contract's order. The result is clipped to the servos' range; ``last_targets`` holds
-        the targets before that.
+        the targets before clipping.
         """
         action = self.contract.action
         self._frames = self._look(measurement, commands)
@@ -310,7 +311,7 @@ class Controller:
             actions = self._network(seen)
         else:
             actions, self.memory = self._network(seen, self.memory)
-        actions = np.where(np.isfinite(actions), actions, np.nan)  # a clipped infinity would pass for a valid action
+        actions = np.where(np.isfinite(actions), actions, np.nan)  # clipping would turn infinity into a valid action
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {
             "default": self.contract.default_pose,
@@ -321,12 +322,12 @@ class Controller:
         return action.held(self.last_targets)
 
     def estimate(self, row: str) -> NDArray[np.float64] | None:
-        """The policy's last estimate of ``row`` (N, size), in the contract's unit; None without an estimate of it."""
+        """The policy's last estimate of ``row`` (N, size), in the contract's unit; None if there is none."""
         columns, believed = columns_of(self.contract.estimate, row), getattr(self._network, "estimate", None)
         return None if columns is None or believed is None else believed[:, columns].astype(np.float64)
 
     def reset(self, which: Any = slice(None)) -> None:
-        """Start the robots ``which`` (indices or a mask) again, without any memory."""
+        """Reset the robots ``which`` (indices or a mask): history, last actions, memory and reference frame."""
         self.last_actions[which], self.last_targets[which], self._fresh[which] = 0.0, self.contract.default_pose, True
         if self.memory is not None:
             self.memory[which] = 0.0
@@ -334,7 +335,7 @@ class Controller:
             self.follower.reset(which)
 
     def _look(self, measurement: Measurement, commands: Floats) -> list[NDArray[np.float32]]:
-        """Frames (N, history, size) of each row, the newest last."""
+        """The frames (N, history, size) of each row. The newest frame is last."""
         computed = {
             "command": commands,
             "last_action": self.last_actions,
@@ -363,10 +364,10 @@ def _side_by_side(frames: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable[[], None] = lambda: None) -> Any:
-    """Return, or raise, the result of ``work`` within ``seconds`` and ``room`` [byte] of new memory.
+    """Run ``work`` in a thread with at most ``room`` [byte] of new memory. Returns its result or raises its error.
 
-    For calls into a foreign file. After ``seconds`` it calls ``stop`` and raises TimeoutError; a thread that does not
-    stop is abandoned. Memory is limited on Linux only.
+    It runs untrusted files. After ``seconds`` it calls ``stop`` and raises TimeoutError; a thread that does not stop
+    is abandoned. Memory is limited on Linux only.
     """
     ended: Future[Any] = Future()
 
@@ -390,7 +391,7 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Within this context the process may take ``size`` [byte] of new memory."""
+    """Context manager: the process can allocate at most ``size`` [byte] of new memory. No effect outside Linux."""
     if not Path("/proc/self/statm").exists():
         yield
         return

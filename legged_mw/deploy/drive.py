@@ -1,4 +1,4 @@
-"""A person drives one robot from a terminal: states, safety, log and loop together. A separate thread prints."""
+"""Drive one robot from a terminal, with states, safety limits and a log. A separate thread prints."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from legged_mw.view.launch import FlagError
 
 CHECK_KEYS = "keys: s start, x damping, Esc emergency stop"
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
-GAMEPADS = Path("/dev/input")  # where Linux has them
+GAMEPADS = Path("/dev/input")  # folder of Linux's gamepads
 STATUS = 0.2  # [s] between two status lines
 
 
@@ -78,7 +78,7 @@ def _checks_joints(args: argparse.Namespace) -> bool:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse flags that do not go together. Raises FlagError or LimitError."""
+    """Check the combination of flags. Raises FlagError or LimitError."""
     others = [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]
     if args.check_joints and others:
         raise FlagError(f"--check_joints moves one joint of a robot at a time: leave --{others[0]} out")
@@ -106,13 +106,13 @@ def check_flags(args: argparse.Namespace) -> None:
 
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
-    """True if a simulated robot begins on a hoist."""
+    """True if a simulated robot starts on a hoist."""
     checked = _checks_joints(args)
     return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or checked))
 
 
 def lift(args: argparse.Namespace) -> float:
-    """Height [m] of the hoisted robot above its start."""
+    """Height [m] of a hoisted robot above its start position."""
     return LIFT * (args.hoist == "high" or (args.hoist is None and _checks_joints(args)))
 
 
@@ -125,11 +125,11 @@ def drive(
     kind: str,
     contact: str | None = None,
 ) -> None:
-    """Drive ``robot`` until Ctrl-C or for ``args.time``, check its joints, or take it for its first walk.
+    """Drive ``robot`` until Ctrl-C or for ``args.time`` [s], or run its joint check, chirp or first walk.
 
-    A joint check or a first walk in which something is wrong exits with code 1.
-    ``fixed`` (C,) is the command while no source drives; None: the defaults. ``kind``: of robot, for the log.
-    ``contact``: of Odometry, if any.
+    If one of these three finds a fault, the exit code is 1.
+    ``fixed`` (C,) is the command while no input source drives; None: the defaults. ``kind`` of robot, for the log.
+    ``contact``: the source of foot contact for Odometry; None: no odometry.
     """
     with ExitStack() as stack:
         stack.callback(robot.close)
@@ -153,10 +153,10 @@ def drive(
         stack.callback(states.close)
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None
-        # last, so that a refused run leaves no log
+        # opened last, so that an error before leaves no log
         log = Log(path, contract, folder, kind, console.say) if path else None
         console.say(f"{CHECK_KEYS if args.check_joints or args.chirp else KEYS}\n{states.state}: {states.note}")
-        # right before the run, which ends damped at any of them
+        # set directly before the run, which damps the robot at a signal
         stack.enter_context(_ended_by_signals())
 
         def show(now: float, measured: Measurement | None) -> None:
@@ -174,7 +174,7 @@ def drive(
 
 
 def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[InputSource]:
-    """Input sources in the order of priority: the first one that drives wins."""
+    """The input sources in the order of priority. The first source with a command drives."""
     sources: list[InputSource] = [RobotRemote(contract.commands)]
     if args.stop_fd is not None:
         sources.append(StopFile(args.stop_fd))
@@ -187,7 +187,7 @@ def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], 
 
 
 def _gamepad(contract: Contract, asked: str | None) -> Gamepad | None:
-    """The gamepad at path ``asked``; None: the first that opens, if any. Raises RobotError."""
+    """The gamepad at the path ``asked``; None: the first gamepad that opens, if any. Raises RobotError."""
     if asked:
         return None if asked == "off" else Gamepad(Path(asked), contract.commands)
     for path in sorted(GAMEPADS.glob("js*")):
@@ -199,7 +199,7 @@ def _gamepad(contract: Contract, asked: str | None) -> Gamepad | None:
 def _commands(
     contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, say: Callable[[str], None]
 ) -> Callable[[float], Floats]:
-    """The command (C,) at a time [s] since the policy began: from the script, else fixed, else the defaults."""
+    """The command (C,) at a time [s] since the policy began: of the script, else ``fixed``, else the defaults."""
     rest = np.array([each.default for each in contract.commands]) if fixed is None else np.array(fixed)
     if not args.commands:
         return lambda _: rest
@@ -214,7 +214,7 @@ def _commands(
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """SIGTERM and a closed terminal damp the robot as Ctrl-C does."""
+    """Context manager: SIGTERM and a closed terminal damp the robot like Ctrl-C."""
     asked = (signal.SIGTERM, signal.SIGHUP)
     before = [signal.signal(each, signal.default_int_handler) for each in asked]
     try:
@@ -225,7 +225,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 class DriveConsole:
-    """Prints lines on a thread, with a status below them in a terminal. A terminal that hangs delays no step."""
+    """Prints lines on a thread, and in a terminal also a status line. A blocked terminal delays no step."""
 
     def __init__(self, contract: Contract) -> None:
         self._units = with_units(contract.commands)
@@ -242,18 +242,18 @@ class DriveConsole:
         self._thread.join(timeout=1.0)
 
     def say(self, line: str) -> None:
-        """Print a line that stays."""
+        """Print a line."""
         self._lines.put((line, False))
 
     def show(self, now: float, states: States) -> None:
-        """Overwrite the status line: state and command."""
+        """Overwrite the status line with the state and the command."""
         if self._terminal and now >= self._next and self._lines.qsize() < 10:
             self._next = now + STATUS
             command = " ".join(f"{value:+.2f}" for value in states.command)
             self._lines.put((f"{now:7.1f} s  {states.state:<11}  command {command} ({self._units})", True))
 
     def _print(self) -> None:
-        with suppress(OSError, ValueError):  # the terminal is gone: the run goes on and ends by its own rules
+        with suppress(OSError, ValueError):  # the terminal is closed; the run continues
             while (entry := self._lines.get()) is not None:
                 line, fleeting = entry
                 clear = "\r\x1b[K" if self._terminal else ""

@@ -1,7 +1,7 @@
 """Input sources: the robot's remote, a gamepad, the keys of a terminal, a file descriptor that stops the robot.
 
-The loop polls each source once a step. A source must not block. It returns the buttons pressed since the last poll, the
-command of its sticks, and a reason to stop. Nothing here moves a robot.
+The loop polls each source once per step. A source must not block. It returns the buttons pressed since the last poll,
+the command of its sticks, and a reason to stop. This module moves no robot.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from legged_mw.deploy.robot import Floats, Health, Remote, RobotError
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.view.drive import ACTIONS, BINDINGS, Pilot
 
-START, WALK, END = "start", "A", "select"  # buttons of the states, as in unitree_rl_gym
-STOP = frozenset({"L2", "B"})  # held together: emergency stop [unitree_rl_lab]
+START, WALK, END = "start", "A", "select"  # buttons that change the state [unitree_rl_gym]
+STOP = frozenset({"L2", "B"})  # pressed together: emergency stop [unitree_rl_lab]
 DEAD = 0.08  # [-] deadband of a stick around its centre
 _STICKS = dict(zip(VELOCITY, (("ly", 1.0), ("lx", -1.0), ("rx", -1.0)), strict=True))  # command -> stick, sign
 
@@ -33,28 +33,28 @@ class DriveInput(NamedTuple):
     """The input of one step."""
 
     pressed: frozenset[str] = frozenset()  # of START, WALK, END, since the last step
-    command: Floats | None = None  # (C,); None: this source does not drive now
+    command: Floats | None = None  # (C,); None: this source gives no command now
     stop: str = ""  # reason to damp the robot at once
 
 
 class InputSource(Protocol):
-    """An input source: it may drive."""
+    """The interface of an input source."""
 
     def poll(self, health: Health) -> DriveInput:
         """The input since the last call."""
         ...
 
     def let_go(self) -> None:
-        """Another source drives now: clear this source's command."""
+        """Clear this source's command, because another source drives now."""
 
     def close(self) -> None:
-        """Free keys and files. Safe to call twice."""
+        """Release the terminal and close files. Safe to call twice."""
 
 
 def from_sticks(remote: Remote, table: Sequence[Command]) -> Floats | None:
-    """Command (C,) of the sticks; None if all are centred.
+    """The command (C,) of the sticks; None if all are centred.
 
-    A stick's ends are the ends of the trained range, its centre is the default.
+    The ends of a stick are the ends of the trained range. Its centre is the default.
     """
     wanted, moved = np.array([each.default for each in table]), False
     for column, each in enumerate(table):
@@ -89,7 +89,7 @@ class RobotRemote:
 
 
 class Gamepad(RobotRemote):
-    """A gamepad with an Xbox layout, at Linux's joystick interface, e.g. /dev/input/js0."""
+    """A gamepad with an Xbox layout on Linux's joystick interface, e.g. /dev/input/js0."""
 
     name = "the gamepad"
     _EVENT = struct.Struct("<IhBB")  # time [ms], value, kind, number [linux/joystick.h]
@@ -98,7 +98,7 @@ class Gamepad(RobotRemote):
     _TRIGGERS = {2: "L2", 5: "R2"}  # -1 at rest
 
     def __init__(self, path: Path, table: Sequence[Command]) -> None:
-        """Open the gamepad. Raises RobotError if that fails."""
+        """Open the gamepad. Raises RobotError if this fails."""
         super().__init__(table)
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -111,7 +111,7 @@ class Gamepad(RobotRemote):
         pressed = frozenset[str]()
         while not self._lost and (event := self._event()):
             self._take(*event)
-            pressed |= self._wish(self._remote()).pressed  # a short press may begin and end between two steps
+            pressed |= self._wish(self._remote()).pressed  # a press can begin and end between two steps
         if self._lost:
             return DriveInput(stop=f"{self.name} was unplugged")
         wish = self._wish(self._remote())
@@ -126,7 +126,7 @@ class Gamepad(RobotRemote):
         return Remote(frozenset(self._buttons), **self._sticks)
 
     def _event(self) -> tuple[int, int, int] | None:
-        """Value, kind and number of the next event; None if there is none yet."""
+        """The value, kind and number of the next event; None if there is none yet."""
         try:
             data = os.read(self._file, self._EVENT.size)
         except BlockingIOError:
@@ -139,7 +139,7 @@ class Gamepad(RobotRemote):
         return self._EVENT.unpack(data)[1:]
 
     def _take(self, value: int, kind: int, number: int) -> None:
-        kind &= 0x7F  # the highest bit marks the state at opening
+        kind &= 0x7F  # the highest bit marks the initial state
         if kind == 2 and number in self._AXES:
             stick, sign = self._AXES[number]
             self._sticks[stick] = sign * value / 32767
@@ -153,7 +153,7 @@ class Gamepad(RobotRemote):
 
 
 class Keys:
-    """Keys of a terminal, or lines of a pipe. Arrows, q, e, u, j, space and o drive as in the viewers."""
+    """The keys of a terminal or the characters of a pipe. Arrows, q, e, u, j, space and o drive as in the viewers."""
 
     STATES = {"s": START, "a": WALK, "x": END}
     _ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[D": "left", "\x1b[C": "right"}
@@ -161,7 +161,7 @@ class Keys:
     _DRIVE = {key for b in BINDINGS[: ACTIONS.index("own") + 1] for key in b.keys}
 
     def __init__(self, table: Sequence[Command], file: int | None = None) -> None:
-        """Read from descriptor ``file`` (None: standard input). A terminal sends single keys until ``close``."""
+        """Read from the descriptor ``file`` (None: standard input). A terminal sends single keys until ``close``."""
         self._file = sys.stdin.fileno() if file is None else file
         self._pilot, self._closed = Pilot(table), False
         self._before = termios.tcgetattr(self._file) if os.isatty(self._file) else None
@@ -194,7 +194,7 @@ class Keys:
         self._before = None
 
     def _read(self) -> list[str]:
-        """Names of the keys pressed since the last call."""
+        """The names of the keys pressed since the last call."""
         text = ""
         while not self._closed and select.select([self._file], [], [], 0)[0]:
             try:
@@ -212,7 +212,7 @@ class Keys:
 
 
 class StopFile:
-    """Stops the robot when a file descriptor is readable or its other end closes: for a switch or a watchdog."""
+    """Stops the robot when a file descriptor is readable or closed at its other end, for a switch or a watchdog."""
 
     def __init__(self, file: int) -> None:
         """Raises RobotError if the descriptor is not open."""

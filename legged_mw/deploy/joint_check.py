@@ -1,9 +1,9 @@
-"""The joint check: each joint in turn goes 0.1 rad and back, softly, while the others are held.
+"""The joint check: each joint in turn moves 0.1 rad and back with low stiffness. The other joints are held.
 
-It finds a wrong joint and a wrong sign. It replaces ``States``: zero torque -> (start) -> joint check -> damping, under
-the same safety layer.
-Angles come from the motors' encoders. They look right if a motor is plugged in or mounted wrongly together with its
-encoder. For legs, the tilt of a freely hanging body then shows the direction; otherwise only a watching person can.
+It detects a wrong joint and a wrong sign. It replaces ``States``: zero torque -> (start) -> joint check -> damping.
+The same safety limits apply.
+Angles come from the motors' encoders. They look right if a motor is connected or mounted wrongly together with its
+encoder. For legs, the tilt of a freely hanging body then shows the fault. For other joints a person must watch.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHECK, DAMPING, SOFT, ZERO, Order, States
 
 STEP = 0.1  # [rad] motion of a joint
-LIFT = 0.3  # [m] ours: hangs a simulated robot so high that its feet cannot touch the ground
+LIFT = 0.3  # [m] ours: height of a hanging simulated robot, whose feet must not touch the ground
 SETTLE, RAMP, REST = 2.0, 0.8, 0.6  # [s] ours: until all joints are held; ramp between two poses; rest after each joint
-SOFTLY, HOLD = 0.4, 1.2  # [s] ours, at the step: before the joint gets stiffer; before the verdict
-# [share of the stiffness per second] until the joint moves enough; SOFT may not overcome friction and weight
+SOFTLY, HOLD = 0.4, 1.2  # [s] ours, after the ramp: until the stiffness rises; until the verdict
+# [share of the stiffness per second] until the joint moves enough; SOFT may be too weak for friction and weight
 STIFFEN = 1.5
-CLOSE, MOVED, FAR = 0.07, 0.03, 0.3  # [rad] ours: moved enough; moved at all; so far that the check ends
-LEAN, ALONG = 2e-3, 0.3  # [rad] ours: smallest useful tilt; cosine at which a tilt agrees with the joint
-HEAVY = 0.4  # [share of the mass] ours: with more on the joint's far side, as for a waist, the tilt tells nothing
+CLOSE, MOVED, FAR = 0.07, 0.03, 0.3  # [rad] ours: enough motion; smallest motion; motion that ends the check
+LEAN, ALONG = 2e-3, 0.3  # ours: [rad] smallest useful tilt; [-] cosine at which a tilt agrees with the joint
+HEAVY = 0.4  # [share of the mass] ours: if the joint moves more, as a waist does, the tilt is not used
 
 Moves = Generator[Order, Measurement, None]
 
@@ -38,14 +38,14 @@ class JointResult(NamedTuple):
     """The result of one joint."""
 
     joint: int
-    asked: float  # [rad] commanded step
-    moved: Floats  # (D,) [rad] motion of all joints
-    stiffness: float  # share of the contract's stiffness that the motion needed
+    asked: float  # [rad] commanded motion
+    moved: Floats  # (D,) [rad] measured motion of all joints
+    stiffness: float  # [share of the contract's stiffness] at the end of the motion
     verdict: str  # "right", or the fault
 
 
 class JointCheck(States):
-    """The check of one robot. ``rows`` and ``report`` hold the result."""
+    """The joint check of one robot. ``rows`` and ``report`` hold the result."""
 
     first = CHECK
 
@@ -57,7 +57,7 @@ class JointCheck(States):
         robot: Robot,
         limits: Limits,
     ) -> None:
-        """Raises RobotError if the robot cannot move softly."""
+        """Raises RobotError if the robot cannot change its gains."""
         if not robot.can_change_gains:
             raise RobotError(
                 f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved"
@@ -100,7 +100,7 @@ class JointCheck(States):
         early = self.state == CHECK and len(self.rows) < len(self.joints)
         super()._enter(state, now, f"{note}, while {self.note}" if early else note)
 
-    # ---- the moves: a generator that is sent measurements and yields orders
+    # ---- motions: generators that receive measurements and yield orders
 
     def _check(self, measured: Measurement) -> Moves:
         limits, held = self._limits, np.ones(len(self.joints))
@@ -120,7 +120,7 @@ class JointCheck(States):
                 return
 
     def _one(self, joint: int, pose: Floats) -> Moves:
-        """Move a joint up, hold, and move it back; downwards if there is no room above."""
+        """Move a joint by STEP, hold it, and move it back. It moves by -STEP near its upper limit."""
         contract, limits, gains, to = self.controller.contract, self._limits, np.ones(len(pose)), pose.copy()
         top = min(limits.high[joint], limits.highest[joint])
         step = STEP if pose[joint] + STEP <= top else -STEP
@@ -152,7 +152,7 @@ class JointCheck(States):
         contract = self.controller.contract
         return Order(CHECK, targets.copy(), share * contract.stiffness, contract.damping)
 
-    # ---- what they mean
+    # ---- verdicts
 
     def _verdict(self, joint: int, step: float, moved: Floats, tilts: bool) -> str:
         own, other = float(np.sign(step) * moved[joint]), self._other(joint, moved)
@@ -167,17 +167,18 @@ class JointCheck(States):
         return "right" if tilts else "WRONG SIGN OR JOINT: the body did not tilt as this joint tilts it"
 
     def _other(self, joint: int, moved: Floats) -> int:
-        """The other joint with the largest motion."""
+        """Index of the other joint with the largest motion."""
         return int(np.argmax(np.where(np.arange(len(moved)) == joint, 0.0, np.abs(moved))))
 
     def _tilts(self, joint: int, before: Measurement, there: Measurement, back: Measurement) -> bool:
-        """False if the body tilts another way, there and back, than a freely hanging one.
+        """False if both measured tilts differ from the tilt of a freely hanging body.
 
-        Its centre of mass must stay below the rope.
+        The centre of mass of a hanging body stays below the rope. True if a tilt is too small or the joint moves too
+        much of the mass.
         """
         model, data, centres = self._scene.model, mujoco.MjData(self._scene.model), []
         for measured in (before, there):
-            data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)  # body frame, as gravity is
+            data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)  # body frame, like gravity
             data.qpos[[model.joint(name).qposadr[0] for name in self.joints]] = measured.joint_pos
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
@@ -197,7 +198,7 @@ class JointCheck(States):
 
     @property
     def report(self) -> str:
-        """A line per joint and a summary; begins with a newline."""
+        """A newline, one line per joint, and a summary."""
         width = max(map(len, self.joints))
         form = f"{{:<{width}}} {{:>5}} {{:>6}} {{:>6}} {{:>9}}  {{:<{width + 7}}} {{}}"
         lines = [form.format("joint", "motor", "asked", "moved", "stiffness", "most of the others", "verdict")]

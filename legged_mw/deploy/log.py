@@ -1,8 +1,8 @@
 """The log of a run on one robot, in one compressed file: measurements, observations, actions, commands, trips.
 
-The file is a sequence of blocks. A block is its length (8 bytes, little-endian) and an .npz of that length: first a
-header with the export's files, then the columns of CHUNK steps at a time.
-A process that dies loses only the last chunk. The file holds no code and is read without pickle.
+The file is a sequence of blocks. A block is a length (8 bytes, little-endian) and an .npz of that length. The first
+block is a header with the export's files. Each other block has the columns of CHUNK steps.
+A process that crashes loses only the last chunk. The file holds no code and is read without pickle.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from legged_mw.utils.files import check_name
 
 FORMAT = 1
 CHUNK = 100  # steps per block
-BACKLOG = 60  # blocks in the queue; more would fill the memory if the disk is slow
+BACKLOG = 60  # largest number of blocks in the queue; it limits the memory if the disk is slow
 SUFFIX = ".lmwlog"
 # files of an export to copy into a log, if they exist
 EXPORT = (CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, MOTORS_FILE, MOTION_FILE, TERRAIN_FILE)
@@ -49,18 +49,18 @@ _LENGTH = struct.Struct("<Q")
 
 
 class LogError(UserError, ValueError):
-    """A file that is not a log, or cannot be written."""
+    """The file is not a log or cannot be written."""
 
 
 def log_path(contract: Contract, folder: Path = Path("logs/deploy")) -> Path:
-    """Default path of a run's log."""
+    """The default path of a run's log."""
     return (
         folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
     )
 
 
 def _columns(contract: Contract) -> dict[str, int]:
-    """Values per step: times [s], index of the state in STATES, the controller's rows, the parts of the measurement."""
+    """Column -> values per step. ``time``, ``behind``, ``work`` and ``age`` [s]; ``state`` is an index in STATES."""
     joints = len(contract.joints)
     return {
         **dict.fromkeys(("time", "behind", "work", "age", "state", "voltage"), 1),
@@ -72,14 +72,14 @@ def _columns(contract: Contract) -> dict[str, int]:
 
 
 class Log:
-    """Writes the log of a run. A separate thread compresses and writes, so a step only copies numbers."""
+    """Writes the log of a run. A separate thread compresses and writes; a step only copies numbers."""
 
     def __init__(
         self, path: Path, contract: Contract, folder: Path, robot: str, say: Callable[[str], None] = print
     ) -> None:
-        """Create the file. Raises LogError if that fails. ``say`` gets one line if writing fails later."""
+        """Create the file. Raises LogError if this fails. ``say`` gets one line if writing fails later."""
         self.path, self.contract, self._say = path, contract, say
-        self.broken = ""  # why writing stopped
+        self.broken = ""  # error that stopped writing
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("xb")
@@ -97,7 +97,7 @@ class Log:
         files = {name: np.fromfile(folder / name, np.uint8) for name in EXPORT if (folder / name).is_file()}
         self._blocks.put({"header": header, **files})
         self._events: list[tuple[float, str]] = []
-        self._lost = 0  # steps not written
+        self._lost = 0  # steps that were not written
         self._begin()
         self._thread = threading.Thread(target=self._write, name="log", daemon=True)
         self._thread.start()
@@ -138,11 +138,11 @@ class Log:
             self._hand_over()
 
     def event(self, now: float, text: str) -> None:
-        """Log a trip or another event at time ``now`` [s]."""
+        """Log a trip or another event at the time ``now`` [s]."""
         self._events.append((now, text))
 
     def close(self) -> None:
-        """Write the rest. Safe to call twice."""
+        """Write the remaining steps. Safe to call twice."""
         if self._thread.is_alive():
             self._hand_over(last=True)
             self._blocks.put(None)
@@ -156,7 +156,7 @@ class Log:
         }
 
     def backlog(self) -> int:
-        """Number of blocks in the queue."""
+        """The number of blocks in the queue."""
         return self._blocks.qsize()
 
     def _hand_over(self, last: bool = False) -> None:
@@ -181,13 +181,13 @@ class Log:
                     self._file.write(_LENGTH.pack(buffer.tell()) + buffer.getvalue())
                     self._file.flush()
                     steps += len(block.get("time", ()))
-        except OSError as error:  # a full disk; the robot keeps walking
+        except OSError as error:  # e.g. a full disk; the run continues
             self.broken = f"the log {shown(self.path)} ends after {steps} steps: {error.strerror or error}"
             self._say(self.broken)
 
 
 def _believed(controller: Controller) -> Any:
-    """The rows of the last estimate, side by side."""
+    """The values of all rows of the last estimate; NaN without an estimate."""
     rows = [controller.estimate(row.name) for row in controller.contract.estimate]
     known = [row[0] for row in rows if row is not None]
     return np.concatenate(known) if known else np.nan
@@ -208,7 +208,7 @@ class DriveLog:
 
 
 def read_log(path: Path) -> DriveLog:
-    """Read the log, without a truncated last block. Raises LogError."""
+    """Read the log. A truncated last block is ignored. Raises LogError."""
     try:
         first, *blocks = _blocks(path)
         header = json.loads(str(first["header"]))

@@ -1,7 +1,7 @@
-"""The clock of a control loop: absolute deadlines, lateness, and no garbage collection within a step.
+"""The clock of a control loop: absolute deadlines, delays, and no garbage collection within a step.
 
-Deadline k is start + k * period, however long a step took, so the loop does not drift.
-Nothing here knows a robot or a policy.
+Deadline k is start + k * period, independent of the durations of the steps, so the loop does not drift.
+This module depends on no robot and no policy.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-LATE = 0.5  # [periods]; a step that begins later counts as late
-KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst is that of the whole run
-_PRIORITY = 20  # ours, of 1 to 99: above everything that is not real time, below a kernel's own threads
-_YIELD = 5e-4  # [s] that another thread may hold the interpreter; Python's own 5 ms would make a step late
-# [s] of waiting that a collection needs; it takes 0.1 ms, as frozen objects are skipped
+LATE = 0.5  # [periods] a step that begins later counts as late
+KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst value is of the whole run
+_PRIORITY = 20  # ours, of 1 to 99: above all threads that are not real-time, below the kernel's threads
+_YIELD = 5e-4  # [s] thread switch interval of the interpreter; Python's default of 5 ms would make a step late
+# [s] shortest wait that allows a collection; it takes 0.1 ms, because frozen objects are skipped
 _SPARE = 0.003
 
 
 class Spread(NamedTuple):
-    """Median, 99th percentile and worst of a time [s]."""
+    """Median, 99th percentile and largest value of a time [s]."""
 
     median: float
     p99: float
@@ -42,13 +42,13 @@ class Spread(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How well a loop kept its time."""
+    """The timing of a loop."""
 
-    jitter: Spread  # how late steps began
+    jitter: Spread  # delay of a step's begin
     work: Spread  # duration of a step
     steps: int
     late: int  # steps that began more than LATE periods late
-    lost: int  # periods skipped because the step before took longer
+    lost: int  # periods skipped because the previous step took too long
 
     def __str__(self) -> str:
         lost = f", {self.lost} periods left out" if self.lost else ""
@@ -56,10 +56,10 @@ class Timing(NamedTuple):
 
 
 class _Samples:
-    """The last KEPT values and the worst value ever. Memory is fixed."""
+    """The last KEPT values, and the largest of all values. The memory is fixed."""
 
     def __init__(self) -> None:
-        # allocated now: zeros() would be paged in later, in the middle of a run
+        # full() writes the memory now; zeros() would cause page faults during the run
         self.values = np.full(KEPT, 0.0, dtype=np.float32)
         self.count, self.worst = 0, 0.0
 
@@ -75,10 +75,10 @@ class _Samples:
 
 
 def real_time(priority: int, heirs: bool = False) -> tuple[int, Any] | None:
-    """Run this thread before everything that is not real time: round robin at ``priority``, 1 to 99.
+    """Give this thread real-time scheduling: round robin at ``priority``, 1 to 99.
 
-    ``heirs``: also the threads that it starts from now on.
-    Returns the scheduling before; None without the permission, or on another system than Linux.
+    ``heirs``: new threads of this thread inherit it.
+    Returns the previous scheduling; None without permission or outside Linux.
     """
     try:
         before = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -89,23 +89,23 @@ def real_time(priority: int, heirs: bool = False) -> tuple[int, Any] | None:
 
 
 class Loop:
-    """Keeps the time of each step, in ``ticks``.
+    """Yields the time of each step; see ``ticks``.
 
-    ``live``: in real time; else it never waits and leaves the garbage collector alone.
-    As a context it collects garbage while it waits, never within a step.
-    It requests real-time priority from the system, and goes on without it where that is not allowed.
+    ``live``: run in real time; otherwise it does not wait and does not change the garbage collector.
+    As a context manager it collects garbage only while it waits, not within a step.
+    It requests real-time priority, and runs without it if the system refuses.
     """
 
     def __init__(self, period: float, live: bool = True) -> None:
         self.period, self.live = period, live
-        self.now = 0.0  # [s] from the first step to this one, a multiple of the period
-        self.behind = 0.0  # [s] that this step began late
-        self.work = 0.0  # [s] that the step before took
+        self.now = 0.0  # [s] from the first step to this step, a multiple of the period
+        self.behind = 0.0  # [s] delay of this step's begin
+        self.work = 0.0  # [s] duration of the previous step
         self.steps = self.late = self.lost = 0
         self._tick, self._start, self._began = -1, 0.0, 0.0
         self._jitter, self._work = _Samples(), _Samples()
-        self._before = False, 0.0  # garbage collector on; [s] that threads may hold the interpreter
-        self._scheduled: tuple[int, Any] | None = None  # this thread's scheduling before
+        self._before = False, 0.0  # previous settings: garbage collector enabled; [s] thread switch interval
+        self._scheduled: tuple[int, Any] | None = None  # previous scheduling of this thread
 
     def __enter__(self) -> Loop:
         if self.live:
@@ -125,20 +125,20 @@ class Loop:
                 gc.enable()
             if self._scheduled:
                 policy, parameters = self._scheduled
-                # only root may clear that flag again
+                # only root can clear the flag that real_time set
                 os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
 
     def ticks(self, seconds: float = math.inf) -> Iterator[float]:
-        """The time [s] of each step for ``seconds``: when it is due, or at once if it is late.
+        """Yield the time [s] of each step for ``seconds``, at its deadline, or at once if it is late.
 
-        A deadline missed by a whole period is skipped.
+        A deadline that is missed by a whole period is skipped.
         """
         while self._wait() < seconds - 1e-9:
             self.steps += 1
             yield self.now
 
     def timing(self) -> Timing:
-        """Timing up to now."""
+        """The timing until now."""
         return Timing(self._jitter.spread(), self._work.spread(), self.steps, self.late, self.lost)
 
     def _wait(self) -> float:
@@ -159,7 +159,7 @@ class Loop:
         return self.now
 
     def _end_step(self) -> None:
-        """Wait for the next deadline that is less than a period ago."""
+        """Wait for the next deadline. Skip the deadlines that are a period or more ago."""
         ended = time.perf_counter()
         self.work = ended - self._began
         self._work.add(self.work)
@@ -170,4 +170,4 @@ class Loop:
         due = self._start + self.now
         if due - ended > _SPARE:
             gc.collect()
-        time.sleep(min(self.period, max(0.0, due - time.perf_counter())))  # a clock set back must not wait longer
+        time.sleep(min(self.period, max(0.0, due - time.perf_counter())))  # never longer than a period

@@ -1,7 +1,7 @@
-"""A live view of a driven robot, in a window or on a web page: its joints, its state and why, and one button: damp.
+"""A live view of a driven robot, in a window or on a web page: its joints, its state and reason, and a damp button.
 
-A separate process draws, so the view delays no step; closing it stops nothing. It cannot drive, since a browser may
-close without notice. The robot's place in the view is integrated from its velocity, if known.
+A separate process draws, so the view delays no step. Closing the view does not stop the robot. The view cannot drive,
+because a browser can close without notice. The position in the view is integrated from the velocity, if known.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from legged_mw.view.session import Session, signed
 from legged_mw.view.stage import ViewError
 
 RATE = 25.0  # [Hz] of frames
-START = 30.0  # [s] for a viewer to open
-# the only actions, each with its label; "": the label of BINDINGS
+START = 30.0  # [s] time limit for a viewer to open
+# the only actions and their labels; "": the label of BINDINGS
 ACTIONS = {"reset": "Damp", "camera": "", "help": ""}
 DAMP = b"damp"
 _PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # fields of a measurement
@@ -43,7 +43,7 @@ LIVE = ("native", "web")  # live values of --viewer
 
 
 class RobotMonitor:
-    """The robot program's end of the view. It is also an input source (``inputs.InputSource``): it can only damp."""
+    """The robot program's side of the view. It is also an input source (``inputs.InputSource``) that can only damp."""
 
     def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
         """Open the viewer in ``args`` (see ``launch.add_flags``). Raises ViewError."""
@@ -63,7 +63,7 @@ class RobotMonitor:
             raise ViewError(problem)
 
     def _problem(self) -> str:
-        """Wait for the viewer. Returns why it did not open, or an empty string."""
+        """Wait for the viewer. Returns the reason if it did not open, else an empty string."""
         end, alive = time.monotonic() + START, True
         self._channel.settimeout(0.1)
         while alive:
@@ -73,12 +73,12 @@ class RobotMonitor:
         return f"the viewer did not start: it ended, or took longer than {START:g} s; leave --viewer out"
 
     def begin(self, contract: Contract, channel: socket.socket) -> None:
-        """Send the robot's state through ``channel`` from now on."""
+        """Initialise the messages, which ``show`` sends through ``channel``."""
         self._period, self._channel, self._due, self._health = contract.period, channel, 0.0, Health()
         self._x = self._y = self._heading = 0.0  # [m], [m], [rad] since the start
 
     def show(self, now: float, measured: Measurement | None, states: States) -> None:
-        """Call once a step; it sends the state RATE times a second."""
+        """Send the robot's state RATE times per second. Call it once per step."""
         if measured is not None:
             vx, vy, rate = (float(value) for value in (*measured.lin_vel[:2], -measured.gravity @ measured.ang_vel))
             if math.isfinite(vx + vy + rate):
@@ -121,7 +121,7 @@ class RobotMonitor:
 
 
 class MirroredStage:
-    """The robot's latest state, as a stage (the viewers' protocol ``Stage``). It steps no physics."""
+    """The robot's latest state as a stage (the viewers' protocol ``Stage``). It steps no physics."""
 
     num_worlds, dt = 1, 1.0 / RATE
 
@@ -131,7 +131,7 @@ class MirroredStage:
         self.spec, self._model, self._data, self._channel = scene.spec, scene.model, mujoco.MjData(scene.model), channel
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         self.command_table, self._parent = self.contract.commands, os.getppid()
-        # index of the foot of each foot geom, in the order of the sensors
+        # foot index of each foot geom, in the order of the sensors
         self._foot = [
             foot
             for _, foot in sorted(
@@ -141,7 +141,7 @@ class MirroredStage:
         self.latest: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
 
     def step(self, commands: Floats | None) -> None:
-        """Take the newest message. This process ends with the robot's program."""
+        """Read the newest message. Exit if the robot's program has ended."""
         newest = None
         with suppress(BlockingIOError):
             while data := self._channel.recv(1 << 16):
@@ -186,7 +186,7 @@ class MirroredStage:
     def push(self, world: int, velocity: Floats) -> None: ...
 
     def reset(self, world: int) -> None:
-        """The button was pressed: damp the robot."""
+        """Damp the robot. The viewer calls this for its button."""
         with suppress(OSError):
             self._channel.send(DAMP)
 

@@ -1,10 +1,10 @@
-"""Leg odometry: the velocity of the IMU [m/s] from joints, gyro, accelerometer and standing feet.
+"""Leg odometry: the velocity of the IMU [m/s] from joints, gyro, accelerometer and stance feet.
 
-The velocity part of the filter of Bledt et al., "MIT Cheetah 3: Design and Control of a Robust, Dynamic Quadruped
-Robot", IROS 2018. The accelerometer predicts the velocity. Each standing foot corrects it: the foot does not move, so
-the leg's motion is the body's motion. The state has no positions of body or feet, so the ground may have any height,
-and one number is the variance of all three axes. Ours: a foot that disagrees with the prediction counts less, as it
-slips or just touches down (Cauchy's weight). Nothing here depends on a robot class or a policy.
+It is the velocity part of the filter of Bledt et al., "MIT Cheetah 3: Design and Control of a Robust, Dynamic Quadruped
+Robot", IROS 2018. The accelerometer predicts the velocity. Each stance foot corrects it: the foot does not move, so
+the leg's motion is the body's motion. The state has no positions of body or feet, so the ground can have any height.
+All three axes have one variance. Ours: a foot that disagrees with the prediction gets a smaller weight (Cauchy's),
+because it slips or has just touched down. This module depends on no robot class and no policy.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from legged_mw.deploy.simulated import read_scene
 
 ROW = "lin_vel"  # ContractRow.measured of the velocity
 # The noises are ours, tuned in the walking exam of go1_flat with and without sensor noise. Smaller DRIFT and DOUBT give
-# a calmer estimate. It is then slower to notice a shock between two measurements, which no accelerometer feels.
+# a smoother estimate, but it reacts slower to a shock between two measurements, which the accelerometer misses.
 DRIFT = 4.0  # [m/s^2] noise of the accelerometer over a period
-STANDING = 0.2  # [m/s] velocity noise of a standing foot
-# [m/s] foot speed at which a foot counts half, by the source of its contact
+STANDING = 0.2  # [m/s] velocity noise of a stance foot
+# source of foot contact -> [m/s] foot speed at which the weight of a foot is halved
 DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}
 CONTACTS = tuple(DOUBT)  # sources of foot contact
-LOADED = 0.1  # [weights] force of a standing foot, at least, from joint torques
-CARRIES = 0.6  # [weights] force of all feet, at least, of a robot on its feet alone, not on its belly or a rope
-LEVEL = 0.01  # [m] feet within this height of the lowest foot stand, too, if height is the source of contact
+LOADED = 0.1  # [share of the weight] smallest force of a stance foot, from joint torques
+CARRIES = 0.6  # [share of the weight] smallest force of all feet, if neither belly nor rope carries the robot
+LEVEL = 0.01  # [m] largest height of a stance foot above the lowest foot, if height is the source of contact
 FLAT = 0.05  # [-] sine of the tilt up to which a foot lies flat, not on one of its ends
 
 
 class Legs(NamedTuple):
-    """The legs of N robots, in the IMU's frame."""
+    """Positions, velocities and forces of the legs of N robots, in the IMU's frame."""
 
     place: Floats  # (N, F, 3) [m] from the IMU to the foot's lowest point
     velocity: Floats  # (N, F, 3) [m/s] velocity of the IMU, if the foot stands still
@@ -44,10 +44,10 @@ class Legs(NamedTuple):
 
 
 class Odometry:
-    """Estimates the velocity of ``count`` robots, from one measurement a period."""
+    """Estimates the velocity of ``count`` robots from one measurement per period."""
 
     def __init__(self, folder: Path, contract: Contract, count: int = 1, contact: str = "measured") -> None:
-        """``contact``: the source of foot contact, of CONTACTS. Raises ContractError."""
+        """``contact``: the source of foot contact, one of CONTACTS. Raises ContractError."""
         if not contract.feet:
             raise ContractError(f"{CONTRACT_FILE}: robot: feet is empty; leg odometry needs feet")
         self.contract, self.contact, self._doubt, scene = (
@@ -68,11 +68,11 @@ class Odometry:
         self.reset()
 
     def reset(self, which: Any = slice(None)) -> None:
-        """Set the robots ``which`` (indices or a mask) to rest."""
+        """Reset the estimate of the robots ``which`` (indices or a mask) to zero velocity."""
         self.velocity[which], self._variance[which], self._shock[which] = 0.0, self._doubt**2, np.nan
 
     def __call__(self, measured: Measurement) -> Measurement:
-        """``measured`` with the estimate as its velocity. N robots; one robot needs no leading axis."""
+        """Replace the velocity of ``measured`` by the estimate. N robots; one robot needs no leading axis."""
         gyro, gravity, felt = (
             np.atleast_2d(each) for each in (measured.ang_vel, measured.gravity, measured.acceleration)
         )
@@ -93,7 +93,7 @@ class Odometry:
         return replace(measured, lin_vel=found.reshape(np.shape(measured.lin_vel)))
 
     def stands(self, measured: Measurement, legs: Legs) -> NDArray[np.bool_]:
-        """Standing feet (N, F), by the source of contact."""
+        """(N, F) true for a stance foot, by the source of contact."""
         if self.contact == "measured":
             return np.atleast_2d(measured.foot_contact) > 0.0
         if self.contact == "torque":
@@ -102,14 +102,14 @@ class Odometry:
         return depth > depth.max(axis=1, keepdims=True) - LEVEL
 
     def legs(self, measured: Measurement) -> Legs:
-        """Foot places, body velocities from still feet, and foot forces, from the scene's kinematics."""
+        """Foot positions, body velocities from fixed feet, and foot forces, by the scene's kinematics."""
         parts = (measured.joint_pos, measured.joint_vel, measured.joint_torque, measured.ang_vel, measured.gravity)
         return Legs(*map(np.array, zip(*map(self._legs, *map(np.atleast_2d, parts)), strict=True)))
 
     def down(self, measured: Measurement) -> Floats:
-        """Gravity's direction (3,) from the legs of one robot: the normal of the feet's plane, so down on level ground.
+        """Direction of gravity (3,) from the legs of one robot: the normal of the feet's plane. Exact on level ground.
 
-        NaN unless three feet or more carry the robot. It reads nothing of the IMU.
+        It does not use the IMU. NaN unless three feet or more carry the robot.
         """
         legs = self.legs(replace(measured, gravity=np.array([0.0, 0.0, -1.0]), ang_vel=np.zeros(3)))
         weight = self.contract.mass * self.gravity
@@ -120,7 +120,7 @@ class Odometry:
         return across * np.sign(across @ place.mean(axis=0))
 
     def leaning(self, angles: Floats, axis: Floats) -> Floats:
-        """(D,) [rad] turn of each joint per 1 rad of body turn about ``axis`` (3,), over feet that stay."""
+        """(D,) [rad/rad] rotation of each joint per rotation of the body about ``axis`` (3,), with fixed feet."""
         place, slopes = self._feet_of(angles, np.array([0.0, 0.0, -1.0]))
         found = np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
         return np.array(found, dtype=float)
@@ -128,7 +128,7 @@ class Odometry:
     def _legs(
         self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """The legs of one robot, without the leading axis."""
+        """``Legs`` of one robot, without the leading axis."""
         place, slopes = self._feet_of(angles, gravity)
         wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[
             ..., 0
@@ -136,7 +136,7 @@ class Odometry:
         return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
 
     def _feet_of(self, angles: Floats, gravity: Floats) -> tuple[Floats, Floats]:
-        """Foot places (F, 3) and their derivatives by each joint (F, 3, D). The root stays where the model has it."""
+        """Foot positions (F, 3) [m] and their Jacobians (F, 3, D), in the IMU's frame. The root is fixed."""
         model, data = self.model, self._data
         data.qpos[self._angles] = angles
         mujoco.mj_kinematics(model, data)
@@ -151,10 +151,10 @@ class Odometry:
 
 
 class _Foot:
-    """The shapes of one foot: a centre each, half edges along its own axes, and a radius around them."""
+    """The shapes of one foot. Each has a centre, half edges along its axes, and a radius around them."""
 
     def __init__(self, model: mujoco.MjModel, sensors: tuple[str, ...]) -> None:
-        """``sensors`` of contact name the shapes."""
+        """The contact ``sensors`` name the shapes."""
         self.geoms = [int(model.sensor(name).objid[0]) for name in sensors]
         self.body = int(model.geom_bodyid[self.geoms[0]])
         kinds, sizes, boxes = model.geom_type[self.geoms], model.geom_size[self.geoms], model.geom_aabb[self.geoms]
@@ -165,7 +165,7 @@ class _Foot:
         self.half[rod] = sizes[rod, 1:2] * [0.0, 0.0, 1.0]
 
     def lowest(self, data: Any, down: Floats) -> Floats:
-        """The foot's farthest point (3,) along ``down``."""
+        """The foot's farthest point (3,) in the direction ``down``."""
         turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
         ends = self.centre + self.half * np.clip(down @ turns / FLAT, -1.0, 1.0)
         points = data.geom_xpos[self.geoms] + (turns @ ends[..., None])[..., 0] + self.radius[:, None] * down

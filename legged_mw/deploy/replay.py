@@ -1,7 +1,7 @@
 """Compare a log with a simulation of the same commands: torques, joint errors, velocity and latency, as table and plot.
 
-The simulation starts where the policy began on the robot: same joints, tilt and speed, on level ground. Its targets are
-clipped as the robot's were.
+The simulation starts in the state in which the policy began: the same joint angles, tilt and velocity, on level ground.
+Its targets are clipped like the robot's.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.errors import UserError, shown
 
 LAGS = 12  # [periods] largest latency
-MOVES = 0.02  # [rad] standard deviation below which a target shows no latency
-EXPLAINED = 0.5  # [share] of a torque's variance that the servo must explain to give a latency
-SHORTEST = 50  # policy steps, at least, for a comparison
+MOVES = 0.02  # [rad] smallest standard deviation of a target that gives a latency
+EXPLAINED = 0.5  # [share] smallest part of the torque's variance that the servo's law must explain
+SHORTEST = 50  # smallest number of policy steps for a comparison
 AXES = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
 Rows = dict[str, Floats]  # name -> (T, values)
 
 
 class Replay(NamedTuple):
-    """The longest walk in a log and its simulation. Both have T rows; the simulation fewer if it fell."""
+    """The longest walk in a log and its simulation. Both have T rows; the simulation has fewer after a fall."""
 
     contract: Contract
     recording: DriveLog
@@ -44,9 +44,9 @@ class Replay(NamedTuple):
 
 
 def replay(path: Path, folder: Path | None = None, edited: bool = False) -> Replay:
-    """Simulate the longest walk in a log with the export in ``folder`` (None: the one in the log).
+    """Simulate the longest walk in a log with the export in ``folder`` (None: the export in the log).
 
-    ``edited``: see read_contract. Raises LogError, ContractError.
+    ``edited``: see read_contract. Raises LogError or ContractError.
     """
     recording = read_log(path)
     with tempfile.TemporaryDirectory() as own:
@@ -78,7 +78,7 @@ def _longest(on: Any) -> slice:
 
 
 def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
-    """Simulate the same steps until the robot falls."""
+    """Simulate the same commands until the robot falls."""
     robot, controller, safety = (
         MujocoRobot(folder, contract),
         Controller(folder, contract),
@@ -99,7 +99,7 @@ def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
 
 
 def _pose(robot: MujocoRobot, start: Rows) -> None:
-    """Put the simulated robot into the real one's pose, its lowest foot on the ground."""
+    """Set the simulated robot to the real robot's pose and velocity, with its lowest point on the ground."""
     fleet, contract = robot.fleet, robot.fleet.contract
     data = mujoco.MjData(fleet.model)
     data.qpos[:] = fleet.qpos[0]
@@ -117,8 +117,8 @@ def _pose(robot: MujocoRobot, start: Rows) -> None:
 def latency(rows: Rows, contract: Contract) -> Floats:
     """Latency (D,) [s] from a target to the measured torque: the lag at which the servo's law fits best.
 
-    torque = stiffness * (target - angle) - damping * speed. Stiffness is the contract's; damping is fitted, as some
-    robots leave it out of the measured torque. NaN if no lag explains the torque, or if the target hardly moves.
+    torque = stiffness * (target - angle) - damping * speed. Stiffness is the contract's. Damping is fitted, because
+    the measured torque of some robots excludes it. NaN if no lag explains the torque or the target moves too little.
     """
     columns = zip(
         *(rows[name].T for name in ("target", "joint_pos", "joint_vel", "joint_torque")),
@@ -129,9 +129,9 @@ def latency(rows: Rows, contract: Contract) -> Floats:
 
 
 def _lag(target: Floats, angle: Floats, speed: Floats, torque: Floats, stiffness: float) -> float:
-    """Lag [periods] of one joint.
+    """The lag [periods] of one joint.
 
-    A fraction between two whole lags is about the share of steps in which the older target was still in force.
+    The fraction of a lag is about the share of steps in which the older target was still active.
     """
     if len(target) <= 2 * LAGS or target.std() < MOVES or not torque.any():
         return math.nan
@@ -153,7 +153,7 @@ def _rms(values: Floats) -> Floats:
 
 
 def _lin_vel(rows: Rows, contract: Contract) -> Floats:
-    """(T, 3) [m/s] as measured, else as the policy estimated it, else NaN."""
+    """(T, 3) [m/s] measured velocity, else the policy's estimate, else NaN."""
     columns = columns_of(contract.estimate, "base_lin_vel")
     if rows["lin_vel"].any():
         return rows["lin_vel"]
@@ -179,7 +179,7 @@ def _title(replayed: Replay) -> str:
 
 
 def table(replayed: Replay) -> str:
-    """A table of robot and simulation, a line per joint."""
+    """A table that compares robot and simulation, with one line per joint."""
     contract, rows = replayed.contract, replayed.robot
     robot, simulated = figures(rows, contract), figures(replayed.simulated, contract)
 
@@ -207,11 +207,11 @@ def table(replayed: Replay) -> str:
     return "\n".join([*lines, *(f"{now:8.2f} s  {text}" for now, text in replayed.recording.events)])
 
 
-# ---- the picture
+# ---- plot
 
 
 def draw(replayed: Replay, path: Path) -> None:
-    """Write the plot. Raises UserError without matplotlib."""
+    """Write the plot to ``path``. Raises UserError without matplotlib, and LogError if writing fails."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -255,7 +255,7 @@ def draw(replayed: Replay, path: Path) -> None:
 
 
 def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows, time: Floats) -> None:
-    """Plot vx, vy and yaw rate: commanded, measured, simulated."""
+    """Plot vx, vy and yaw rate: command, robot, simulation."""
     names, made = [each.name for each in contract.commands], len(simulated["target"])
     for i, (axes, title) in enumerate(zip(many, AXES, strict=True)):
         axes.set_title(title)

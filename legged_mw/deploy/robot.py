@@ -1,7 +1,7 @@
 """The interface between a policy and a robot.
 
-To add a real robot, write one class with the three abstract methods of ``Robot`` around its SDK and give it to
-``runner.run``. ``simulated`` has a simulated robot, ``examples/udp_robot.py`` one behind a network link.
+To add a real robot, write a subclass of ``Robot`` with the three abstract methods on its SDK and pass it to
+``runner.run``. ``simulated`` has a simulated robot, ``examples/udp_robot.py`` a robot with a network link.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Floats = NDArray[np.float64]
 
 
 class RobotError(UserError, RuntimeError):
-    """The robot is silent, or its answer does not fit the contract. The text says what happened and what was done."""
+    """The robot does not answer, or its answer does not fit the contract. The text states cause and reaction."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Measurement of one robot at one moment; D joints in the contract's order, F feet. Many robots: (N, ...) each.
+    """A measurement of one robot; D joints in the contract's order, F feet. Of N robots each is (N, ...).
 
-    A value may stay zero if no observation row of the contract needs it.
+    A value can stay zero if no observation row of the contract needs it.
     """
 
     lin_vel: Floats  # (3,) of the IMU, body frame (x forward, y left, z up) [m/s]; a real robot estimates it
@@ -39,8 +39,8 @@ class Measurement:
     joint_torque: Floats  # (D,) [N m]
     acceleration: Floats  # (3,) of the IMU, body frame: (0, 0, 9.81) [m/s^2] when standing level
     foot_contact: Floats  # (F,) 1 for a foot on the ground, else 0
-    # Row -> (size,): rows with sensors of their own, the height scan. For a motion also the root's attitude, and its
-    # position [m], if a row needs it.
+    # Row -> (size,): rows that name their sensors, and the height scan. With a reference motion also the root's
+    # attitude (4,) w x y z, and its position (3,) [m] if a row needs it.
     others: Mapping[str, Floats] = field(default_factory=dict)
 
     def of(self, robot: int) -> Measurement:
@@ -51,13 +51,13 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Remote:
-    """The present state of a remote or gamepad."""
+    """The state of a remote or gamepad. Sticks are in [-1, 1]."""
 
-    buttons: frozenset[str] = frozenset()  # those of BUTTONS that are pressed
-    lx: float = 0.0  # left stick to the right, -1..1, as the others
-    ly: float = 0.0  # left stick ahead
-    rx: float = 0.0  # right stick to the right
-    ry: float = 0.0  # right stick ahead
+    buttons: frozenset[str] = frozenset()  # pressed buttons of BUTTONS
+    lx: float = 0.0  # left stick, positive to the right
+    ly: float = 0.0  # left stick, positive forward
+    rx: float = 0.0  # right stick, positive to the right
+    ry: float = 0.0  # right stick, positive forward
 
 
 # [Unitree] names and order of a remote's buttons
@@ -66,21 +66,21 @@ BUTTONS = ("R1", "L1", "start", "select", "R2", "L2", "F1", "F2", "A", "B", "X",
 
 @dataclass(frozen=True)
 class Health:
-    """The state of a robot beside its measurement; None: not reported."""
+    """The state of a robot's hardware; None: not reported."""
 
-    age_s: float | None = None  # [s] since the newest measurement
+    age_s: float | None = None  # [s] age of the newest measurement
     temperatures: Floats | None = None  # (D,) [deg C] of the motors
     voltage: float | None = None  # [V] of the battery
     remote: Remote | None = None  # None also for a remote that is off or out of reach
-    motor_faults: Mapping[str, str] = field(default_factory=dict)  # joint -> fault that its motor reports
+    motor_faults: Mapping[str, str] = field(default_factory=dict)  # joint -> reported fault of its motor
 
 
-DAMPING = 3.0  # [N m s/rad] lowest damping of a joint without stiffness [unitree_rl_lab, Passive]
+DAMPING = 3.0  # [N m s/rad] smallest damping of a joint without stiffness [unitree_rl_lab, Passive]
 QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
 
 
 def layout(contract: Contract) -> dict[str, int]:
-    """Number of values in each part of a measurement; rows with their own sensors come last."""
+    """Number of values of each quantity of a measurement; the rows in ``Measurement.others`` are last."""
     own = {row.name: row.size for row in contract.rows if row.measured in OWN and row.measured}
     own |= ({ATTITUDE: 4} if contract.motion else {}) | (
         {POSITION: 3} if any(row.measured == PLACE for row in contract.rows) else {}
@@ -89,28 +89,27 @@ def layout(contract: Contract) -> dict[str, int]:
 
 
 def damped(contract: Contract) -> Floats:
-    """Damping (D,) [N m s/rad] of joints without stiffness: the contract's, and at least DAMPING."""
+    """Damping (D,) [N m s/rad] of joints without stiffness: the contract's, but at least DAMPING."""
     return np.maximum(contract.damping, DAMPING)
 
 
 class Robot(ABC):
-    """One robot. Once a ``contract.period`` the caller calls ``read``, then ``write``; the caller keeps the time.
+    """One robot. In each ``contract.period`` the caller calls ``read``, then ``write``. The caller waits.
 
-    Both calls must return well within the period. Joints are in the contract's order, not in the machine's.
+    Both calls must take much less than a period. Joints are in the contract's order, not in the robot's.
     The methods that are not abstract are optional.
     """
 
     can_change_gains = False  # True if `write` applies stiffness and damping
     motors: Mapping[str, int] = {}  # joint -> number of its motor, if motors have numbers
-    # of this machine, which no contract can state: names and units as in safety.Limits
-    limits: Mapping[str, float] = {}
-    # [s] between two measurements of a robot that sends them faster than a policy acts, for the chirp
+    limits: Mapping[str, float] = {}  # limits of this robot; names and units as in safety.Limits
+    # [s] between two measurements, if the robot sends them faster than the policy's rate; for the chirp
     step: float | None = None
-    report: str = ""  # set by `close`: how the link worked during the run, in words
+    report: str = ""  # quality of the link during the run, in words; set by `close`
 
     @abstractmethod
     def read(self) -> Measurement:
-        """The newest measurement. Raises RobotError if it is too old to be used."""
+        """The newest measurement. Raises RobotError if it is too old."""
 
     @abstractmethod
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
@@ -123,25 +122,25 @@ class Robot(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Switch the servos off, so joints are only damped, and close links. Safe to call twice, and after an error."""
+        """Switch the servos off, so that joints are damped, and close links. Safe to call twice and after an error."""
 
     def damp(self) -> None:
-        """For the next period: no stiffness, joints damped. By default it closes the robot.
+        """Damp the joints without stiffness in the next period. By default it closes the robot.
 
-        That ends the run; a robot that stays connected overrides it, and the run goes on damped.
+        This ends the run. A robot that stays connected overrides it, and the run continues.
         """
         self.close()
 
     def limp(self) -> None:
-        """For the next period: no torque at all. By default it calls ``damp``."""
+        """Apply no torque in the next period. By default it calls ``damp``."""
         self.damp()
 
     def health(self) -> Health:
-        """The robot's present health; nothing by default."""
+        """The robot's health; nothing is reported by default."""
         return Health()
 
     def fell(self) -> bool:
-        """True if it fell by a rule that only the robot can check. The caller checks the tilt from ``read``."""
+        """True for a fall by a rule that only the robot can check. The caller checks the tilt from ``read``."""
         return False
 
     def __enter__(self) -> Any:

@@ -1,6 +1,6 @@
 """The control loop between a policy and a robot, at the contract's period.
 
-Nothing here depends on the kind of robot or on the source of commands.
+It does not depend on the type of robot or on the source of commands.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotErro
 from legged_mw.deploy.safety import TORQUE, Limits, Safety, Trip, Tripped
 from legged_mw.deploy.states import DAMPING, POLICY, ZERO, Order, States
 
-_RECENT = 10.0  # [s] of velocities that an endless run keeps
+_RECENT = 10.0  # [s] of velocities that a run without an end stores
 
 
 @dataclass
 class Summary:
-    """The outcome of a run."""
+    """The result of a run."""
 
     steps: int = 0
     late: int = 0  # steps that began more than half a period late
     fell: float | None = None  # [s] of the fall that ended the walk, by the contract's `ends`
     velocity: Floats | None = None  # (3,) mean of vx, vy [m/s] and yaw rate [rad/s] over the second half
     timing: Timing | None = None  # of a live run
-    trips: list[Trip] = field(default_factory=list)  # of a run with states, which goes on damped
+    trips: list[Trip] = field(default_factory=list)  # of a run with states; it continues with the robot damped
 
 
 def run(
@@ -50,14 +50,14 @@ def run(
     log: Log | None = None,
     odometry: Odometry | None = None,
 ) -> Summary:
-    """Run for ``seconds``, or until the robot falls: read, decide and write once a period.
+    """Run for ``seconds``, or until the robot falls. Each period reads the robot, computes an order and writes it.
 
     It closes the robot at the end, also after an error.
-    ``command`` returns (C,), in the contract's order, at a time [s] since the start, clipped to the trained ranges.
-    ``live``: run in real time, as a robot needs; else as fast as the robot answers.
-    ``watch`` gets each measurement. With states it gets None for a step without one.
-    ``safety`` replaces the export's limits. Passing a limit damps the robot and raises Tripped.
-    ``states`` begin at zero torque and bring their own commands; a trip or a fall damps the robot and the run goes on.
+    ``command`` returns (C,) in the contract's order at a time [s] since the start. It is clipped to the trained ranges.
+    ``live``: run in real time, as a real robot needs; otherwise as fast as possible.
+    ``watch`` gets each measurement. With states it gets None for a step without a measurement.
+    ``safety`` replaces the export's limits. An exceeded limit damps the robot and raises Tripped.
+    ``states`` begin at zero torque and replace ``command``. A trip or a fall damps the robot, and the run continues.
     ``odometry`` replaces the measured velocity by its estimate.
     """
     safety = safety or Safety(controller.contract, Limits.of(controller.folder, controller.contract, robot.limits))
@@ -89,7 +89,7 @@ def run(
 
 
 class _Velocities:
-    """Velocities of the last half of a run, or of the last seconds of an endless one. Memory is fixed."""
+    """The velocities of the last half of a run, or of the last seconds of a run without an end."""
 
     def __init__(self, period: float, seconds: float) -> None:
         self._kept: deque[list[float]] = deque(maxlen=math.ceil(min(seconds, 2 * _RECENT) / period / 2) + 1)
@@ -98,12 +98,12 @@ class _Velocities:
         self._kept.append([*measured.lin_vel[:2], measured.ang_vel[2]])
 
     def mean(self, steps: int) -> Floats | None:
-        """Mean (3,) over the second half of ``steps``."""
+        """The mean (3,) over the second half of ``steps``; None without velocities."""
         return np.mean(list(self._kept)[-max(1, steps - steps // 2) :], axis=0) if self._kept else None
 
 
 class _Step:
-    """One control period. Without states the policy acts at once, a trip raises and a fall ends the run."""
+    """Runs one control period. Without states the policy acts at once, a trip raises and a fall ends the run."""
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class _Step:
         return self.summary.fell is not None or (self.states is not None and self.states.over)
 
     def take(self, loop: Loop) -> Measurement | None:
-        """Do one step. Returns the measurement, None if there is none."""
+        """Run one step. Returns the measurement; None if there is none."""
         measured, health, trip = self._sense(loop)
         if self.summary.fell is not None:
             return measured
@@ -144,7 +144,7 @@ class _Step:
         if trip:
             order = self._trip(trip, loop.now)
         else:
-            assert measured  # no measurement always trips
+            assert measured  # a missing measurement is always a trip
             order = self._decide(measured, loop.now)
             if not self.robot.can_change_gains:
                 order = order._replace(stiffness=None, damping=None)
@@ -165,7 +165,7 @@ class _Step:
         return measured
 
     def _sense(self, loop: Loop) -> tuple[Measurement | None, Health, Trip | None]:
-        """Measurement, health, and the reason to stop, if any."""
+        """The measurement, the health, and a trip if there is one."""
         measured, health, trip = None, Health(), None
         try:
             measured, health = self.robot.read(), self.robot.health()
@@ -192,13 +192,13 @@ class _Step:
             return Order(POLICY, self.controller.last_targets[0].copy())
         before, order = self.states.armed, self.states.step(measured, now)
         if self.odometry and not self.states.armed:
-            self.odometry.reset()  # its estimate may be wrong while the robot lies or hangs
+            self.odometry.reset()  # the estimate can be wrong while the robot lies or hangs
         if self.states.armed and not before:
             self.safety.reset()
         return order
 
     def _trip(self, trip: Trip, now: float) -> Order:
-        """Damp the robot, or end a run without states."""
+        """Damp the robot. Raises Tripped without states."""
         if self.states is None:
             raise Tripped(trip)
         if self.states.state != DAMPING:

@@ -1,6 +1,6 @@
-"""Limits between a policy and a robot. Every step is checked. A limit that is passed becomes one line of text.
+"""Safety limits between a policy and a robot. They are checked every step. An exceeded limit gives a `Trip`.
 
-The caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or depends on the robot's type.
+The caller of `Safety` damps the robot. This module moves no joint, reads no clock and depends on no type of robot.
 """
 
 from __future__ import annotations
@@ -20,33 +20,32 @@ from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
 
 TORQUE = "torque"  # origin of an action: its targets are torques
-OFF = math.inf  # a limit that is switched off
-# Values that no joint and no gyro can measure. NaN and infinity are beyond them, too.
-# Ours: a wheel may turn many times; gyros saturate at 35 rad/s.
+OFF = math.inf  # value of a limit that is switched off
+# Bounds that no valid measurement exceeds. Ours: a wheel may turn many times; gyros saturate at 35 rad/s.
 _ABSURD = {"joint_pos": (1e5, "rad"), "joint_vel": (1e4, "rad/s"), "ang_vel": (1e3, "rad/s")}
-# A sensor is frozen if its value stays the same, to the last bit, while another sensor shows motion.
-# Both are compared over _ALONE * Limits.frozen measurements. The thresholds of motion below are ours: the smallest step
-# of an encoder or a gyro is a hundredth of them, and a standing robot moves less.
-_ALONE = 3.0  # 0.24 s at 50 Hz: a coarse sensor may repeat its value for that long, the whole measurement may not
-_MOVED = 0.05  # [rad] moved: a joint by its speed, the body by gyro or gravity, a target while the body moves
-_SWUNG = 0.1  # [rad] moved by a joint: gyro and gravity must change
-_ASKED = 0.2  # [rad] moved by a joint's target: its encoder must change
-_UNIT = 0.1  # deviation of gravity's length from 1; ours: a unit quaternion in float32 gives 1e-6
+# A sensor is frozen if its value is bitwise constant while another sensor measures motion.
+# Both are compared over _ALONE * Limits.frozen measurements. The thresholds of motion are ours: the resolution of an
+# encoder or a gyro is a hundredth of them, and a standing robot moves less.
+_ALONE = 3.0  # 0.24 s at 50 Hz: one coarse sensor can repeat its value for this time, all sensors cannot
+_MOVED = 0.05  # [rad] motion of a joint, of the body (by gyro or gravity), or of a target if the body also moves
+_SWUNG = 0.1  # [rad] motion of a joint after which gyro and gravity must have changed
+_ASKED = 0.2  # [rad] motion of a joint's target after which its encoder must have changed
+_UNIT = 0.1  # [-] largest deviation of gravity's length from 1; ours: a unit quaternion in float32 gives 1e-6
 
 
 class LimitError(UserError, ValueError):
-    """An unknown limit, or a value that it cannot have."""
+    """An unknown limit or an invalid value of a limit."""
 
 
 class Trip(NamedTuple):
-    """A limit that was passed."""
+    """An exceeded limit."""
 
-    limit: str  # name of the limit: a field of Limits, or "finite", "stop", "robot"
-    text: str  # what was measured, and the limit, in one line
+    limit: str  # name of the limit: a field of Limits, or another such as "finite", "fall", "stop", "robot"
+    text: str  # the measured value and the limit, in one line
 
 
 class Tripped(RobotError):
-    """A trip ended the run; the robot is damped."""
+    """A trip ended the run. The robot is damped."""
 
     def __init__(self, trip: Trip) -> None:
         self.trip = trip
@@ -55,41 +54,40 @@ class Tripped(RobotError):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of D joints in the contract's order. The first five come from the machine; the others can be set by name.
+    """Limits of D joints in the contract's order. The first five come from the scene and the contract.
 
-    A default without a source is ours. It is what the shipped policies of Go1, Go2 and G1 need in the walking exam
-    with its pushes of 2 m/s (the figure in brackets), plus a margin. Tighter limits of one robot or policy belong in
-    its contract.
+    A default without a source is ours: the largest value of the shipped policies of Go1, Go2 and G1 in the walking
+    exam with pushes of 2 m/s (in brackets), plus a margin. A robot's class or a contract can set tighter limits.
     """
 
     low: Floats  # (D,) [rad] range of the joints
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] largest torque of the motors
-    # (D,) [rad] range of the targets in the contract; `held` clips to it, as in training, since drives do not
+    # (D,) [rad] range of the targets in the contract; `held` clips to it as training does, because drives do not
     lowest: Floats
     highest: Floats  # (D,) [rad]
-    position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops yield]
-    target: float = 0.9  # [rad] of a target beyond the range [0.62]
-    step: float = 2.5  # [rad] between two targets of a joint in a row [1.85]
-    torque: float = 2.0  # [share of `motor`] of a servo's computed torque [1.52]
-    speed: float = 60.0  # [rad/s] of a joint [48]
-    # [deg] of the body, or less if the contract calls less a fall; where a fall begins beyond 90 deg, that angle [30]
+    position: float = 0.25  # [rad] measured angle beyond the range [0.15: simulated joint limits are soft]
+    target: float = 0.9  # [rad] target beyond the range [0.62]
+    step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.85]
+    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.52]
+    speed: float = 60.0  # [rad/s] joint speed [48]
+    # [deg] tilt of the body [30]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
     tilt: float = 60.0
-    temperature: float = 85.0  # [deg C] of a motor: below the 90 at which drives switch themselves off
-    voltage: float = -OFF  # [V] of the battery, at least; a robot's class sets its own
-    age: float = 2.0  # [periods] since the newest measurement
-    frozen: float = 4.0  # identical measurements in a row, bit for bit
+    temperature: float = 85.0  # [deg C] of a motor; drives switch off at 90
+    voltage: float = -OFF  # [V] lowest voltage of the battery; a robot's class sets it
+    age: float = 2.0  # [periods] age of the newest measurement
+    frozen: float = 4.0  # bitwise identical consecutive measurements
     late: float = 5.0  # steps in one second that began more than half a period late
-    remote: float = 3.0  # [s] since the remote was last received; only if it was there [unitree_rl_lab]
+    remote: float = 3.0  # [s] since the remote was last received, if it ever was [unitree_rl_lab]
 
     @staticmethod
     def of(
         folder: Path, contract: Contract, robot: Mapping[str, Any] | None = None, asked: Mapping[str, Any] | None = None
     ) -> Limits:
-        """The limits of the export in ``folder``.
+        """The limits of the export in ``folder``. Raises LimitError.
 
-        Four sources, the later ones override: the scene (of the machine), the contract's section ``safety``,
-        ``robot`` (of its class), ``asked`` (of the command line).
+        There are four sources. A later one overrides: the scene, the contract's section ``safety``, ``robot``
+        (limits of the robot's class), ``asked`` (limits of the command line).
         """
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
         limits = replace(
@@ -105,7 +103,7 @@ class Limits:
         return limits
 
     def but(self, values: Mapping[str, Any], where: str) -> Limits:
-        """A copy with other values by name; "off" switches a limit off. Raises LimitError."""
+        """A copy with the named limits replaced. "off" switches a limit off. Raises LimitError."""
         return replace(self, **{name: _value(name, value, where) for name, value in values.items()})
 
 
@@ -113,7 +111,7 @@ NAMES = tuple(f.name for f in fields(Limits) if f.default is not MISSING)
 
 
 def parse_limits(texts: Sequence[str]) -> dict[str, str]:
-    """Values by name from "NAME=VALUE" texts of the command line. Raises LimitError."""
+    """Name -> value, from texts "NAME=VALUE" of the command line. Raises LimitError."""
     for text in texts:
         if "=" not in text:
             raise LimitError(f"--limit {text}: write NAME=VALUE or NAME=off; there are: {', '.join(NAMES)}")
@@ -123,7 +121,7 @@ def parse_limits(texts: Sequence[str]) -> dict[str, str]:
 def _value(name: str, value: Any, where: str) -> float:
     if name not in NAMES:
         raise LimitError(f"{where}: {unknown('limit', name, NAMES, 'the safety layer')}")
-    if value in ("off", False):  # YAML reads off as False
+    if value in ("off", False):  # YAML reads `off` as False
         return -OFF if name == "voltage" else OFF
     try:
         number = float(value)
@@ -135,7 +133,7 @@ def _value(name: str, value: Any, where: str) -> float:
 
 
 def limits_of(model: Any, contract: Contract) -> Limits:
-    """Ranges and torques from the compiled scene of an export. A missing range or torque limit becomes "off"."""
+    """Joint ranges and torque limits from the compiled scene of an export. A missing one is "off"."""
     joints = [model.joint(name).id for name in contract.joints]
     servos = [model.actuator(name).id for name in contract.joints]
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
@@ -145,7 +143,7 @@ def limits_of(model: Any, contract: Contract) -> Limits:
 
 
 class _Seen(NamedTuple):
-    """One measurement's signals of motion, and the servos' target before it. Of N measurements each is (N, ...)."""
+    """The motion signals of one measurement, and the servos' previous target. Of N measurements each is (N, ...)."""
 
     joint_pos: Floats
     joint_vel: Floats
@@ -155,7 +153,7 @@ class _Seen(NamedTuple):
 
 
 class Safety:
-    """Checks one robot. It remembers the last steps only."""
+    """Checks the measurements and targets of one robot. It stores the last steps only."""
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
         if contract.action.origin == "speed":
@@ -166,20 +164,20 @@ class Safety:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all steps, when a person starts the robot again."""
-        self._last: Floats | None = None  # (D,) targets of the step before, as the policy gave them
-        self._held: Floats | None = None  # (D,) the same, clipped as the servos got them
+        """Forget all steps, for a new start of the robot."""
+        self._last: Floats | None = None  # (D,) targets of the previous step, before clipping
+        self._held: Floats | None = None  # (D,) the same after clipping
         self._seen = deque[_Seen](
             maxlen=max(1, math.ceil(_ALONE * self.limits.frozen)) if self.limits.frozen < OFF else 1
         )
-        self._same = dict.fromkeys(_Seen._fields[:4], 0)  # sensor -> identical values in a row
-        self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) identical angles in a row
-        self._lived = set[str]()  # sensors except joint_pos that changed at least once; a missing sensor never does
+        self._same = dict.fromkeys(_Seen._fields[:4], 0)  # sensor -> consecutive identical values
+        self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) consecutive identical angles
+        self._lived = set[str]()  # sensors except joint_pos that changed at least once; a missing sensor never changes
         self._late: deque[float] = deque()  # [s] times of late steps within the last second
-        self._remote: float | None = None  # [s] when the remote was last received
+        self._remote: float | None = None  # [s] time at which the remote was last received
 
     def sensed(self, measured: Measurement, health: Health, now: float, behind: float = 0.0) -> Trip | None:
-        """The first limit that a measurement passes. ``now`` [s]; ``behind`` [s]: how late the step began."""
+        """The first limit that a measurement exceeds. ``now`` [s]; ``behind`` [s]: delay of the step's begin."""
         return (
             self._finite(measured)
             or self._fresh(measured, health)
@@ -191,13 +189,13 @@ class Safety:
         )
 
     def held(self, targets: Floats) -> Floats:
-        """Clip ``targets`` (D,) to the servos' range; torques to the motors' range, if their actuators have one."""
+        """Clip ``targets`` (D,) to the contract's range of the targets."""
         return np.clip(targets, self.limits.lowest, self.limits.highest)
 
     def asked(
         self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None
     ) -> Trip | None:
-        """The first limit that targets (D,) [rad], or torques [N m], pass.
+        """The first limit that ``targets`` (D,) [rad], or torques [N m], exceed.
 
         ``stiffness`` and ``damping`` (D,) of the servos; None: the contract's.
         """
@@ -225,7 +223,7 @@ class Safety:
         self._last, self._held = np.array(targets), self.held(targets)
         return trip
 
-    # ---- each limit. Comparisons are written so that NaN is beyond the limit.
+    # ---- one method per limit. NaN exceeds a limit.
 
     def _finite(self, measured: Measurement) -> Trip | None:
         for name in ("joint_pos", "joint_vel", "gravity", "ang_vel"):
@@ -249,7 +247,7 @@ class Safety:
         return self._alive(measured)
 
     def _alive(self, measured: Measurement) -> Trip | None:
-        """Trip if the measurement is frozen, or one sensor is frozen while others show motion."""
+        """Trip if the measurement is frozen, or one sensor is frozen while others measure motion."""
         still = measured.joint_pos if self._held is None else self._held
         parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, still
         seen = _Seen(*map(np.array, parts))  # copies: a robot may reuse its arrays
@@ -270,14 +268,14 @@ class Safety:
         return self._contradicted(frozen, stuck) if frozen or stuck.any() else None
 
     def _contradicted(self, frozen: list[str], stuck: Any) -> Trip | None:
-        """Trip on the first frozen sensor, or ``stuck`` joint (D,), that must have moved by what other sensors show."""
+        """Trip on the first sensor of ``frozen`` or joint of ``stuck`` (D,) that moved according to other sensors."""
         seen = _Seen(*map(np.array, zip(*self._seen, strict=True)))
         count, period = len(seen.joint_pos), self.contract.period
         told = np.ptp(seen.target[: count - count // 3], axis=0)  # a joint needs time to follow the newest targets
         went = np.ptp(period * np.cumsum(seen.joint_vel, axis=0), axis=0)
         moved, leant = float(np.ptp(seen.joint_pos, axis=0).max()), float(np.ptp(seen.gravity, axis=0).max())
         turned = float(np.ptp(period * np.cumsum(np.cross(seen.ang_vel, seen.gravity), axis=0), axis=0).max())
-        # The joints of a body that is carried or pushed may stay still.
+        # if a person carries or pushes the robot, the joints may stay still
         drives = told.max() > _ASKED or (told.max() > _MOVED and max(leant, turned) > _MOVED)
         moves = {
             "joint_pos": drives or went.max() > _MOVED,
@@ -312,7 +310,7 @@ class Safety:
         )
 
     def _tilt(self, measured: Measurement) -> Trip | None:
-        """Trip if the body tilts beyond the robot's limit. The task's rule of a fall, ``Ends.tilted``, holds under the policy only."""
+        """Trip if the tilt exceeds the robot's limit. The task's rule, ``Ends.tilted``, applies to the policy only."""
         tilt = math.degrees(math.acos(np.clip(-measured.gravity[2], -1.0, 1.0)))
         return (
             None
@@ -337,7 +335,7 @@ class Safety:
             return None
         return Trip("remote", f"the remote was not heard for {now - self._remote:.1f} s")
 
-    # ---- the same for all joints
+    # ---- comparisons of all joints
 
     def _most(self, limit: str, words: str, values: Floats, most: float | Floats) -> Trip | None:
         most = np.broadcast_to(most, values.shape)
@@ -360,5 +358,5 @@ class Safety:
 
 
 def _first(wrong: Any) -> int:
-    """Index of the first wrong joint."""
+    """Index of the first true value."""
     return int(np.argmax(wrong))

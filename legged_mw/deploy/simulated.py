@@ -1,9 +1,9 @@
-"""Simulated robots in MuJoCo's C engine, from an export's ``scene.xml``: one ``Robot``, or many side by side.
+"""Simulated robots in MuJoCo's C engine, from an export's ``scene.xml``: one ``Robot``, or a ``Fleet`` of many.
 
-MuJoCo's sensors give the measurements, by name. A physics step computes sensors before it moves the robot. After each
+MuJoCo's sensors give the measurements. A physics step computes the sensors before it moves the robot. After each
 period the sensors of position, velocity and contact are therefore computed again, in the new state.
 Torque and acceleration need forces, so they are one physics step old, as in training.
-In training, contact was one step old, too.
+In training, contact was also one physics step old.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
 from legged_mw.utils.motor_network import DC_DAMPING, DC_STIFFNESS
 
-# ---- a robot placed by its measurements -----------------------------------------------------------------------------
+# ---- pose from measurements -----------------------------------------------------------------------------------------
 
 
 def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity: Floats, heading: float = 0.0) -> None:
-    """Put the robot into a pose at its (x, y) in ``data``, on the ground.
+    """Set the robot's pose in ``data``. It keeps (x, y) and puts the lowest point on the ground.
 
-    ``angles`` (D,) [rad] of ``joints``, ``gravity`` (3,) in the body frame, heading [rad].
+    ``angles`` (D,) [rad] of ``joints``; ``gravity`` (3,) in the body frame; ``heading`` [rad].
     """
     data.qpos[[model.joint(name).qposadr[0] for name in joints]] = angles
     # the world's z axis in the body frame
@@ -65,12 +65,12 @@ def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity:
 
 
 def lowest_point(model: Any, data: Any, geom: int) -> float:
-    """Height [m] of the lowest point of ``geom``: exact for a sphere or capsule, else that of its box."""
+    """Height [m] of the lowest point of ``geom``: exact for a sphere or capsule, else of its bounding box."""
     return float(data.geom_xpos[geom, 2]) - _reach(model, geom, data.geom_xmat[geom])
 
 
 def _reach(model: Any, geom: int, turn: Floats) -> float:
-    """Distance [m] from the centre to the lowest point: exact for a sphere or capsule, else that of its box."""
+    """Height [m] of the centre above the lowest point: exact for a sphere or capsule, else of its bounding box."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         return size[0] + abs(turn[8]) * size[1]
@@ -82,10 +82,10 @@ def _reach(model: Any, geom: int, turn: Floats) -> float:
 Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # recompute the sensors of position and velocity in the new state
 
-_GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees; the robot's own are in other groups
+_GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan detects; the robot's geoms are in other groups
 _SHAPES = 3  # geom group of a robot's collision shapes
-_DEEP, _FAR = 0.1, 1e4  # [m] limits of a start pose: depth under the ground, distance from the origin
-_ABOVE = 2.0  # [m] above the root, where the scan's rays begin
+_DEEP, _FAR = 0.1, 1e4  # [m] limits of a start pose: depth below the ground, distance from the origin
+_ABOVE = 2.0  # [m] height above the root at which the scan's rays begin
 
 
 class Fleet:
@@ -104,16 +104,16 @@ class Fleet:
     ) -> None:
         """Load the scene and put every robot into its first keyframe.
 
-        ``scene_file``: a file's name in the export, or the path of a scene of the user's; ``contract`` is then what it is
-        in that scene. ``whole``: the whole body can touch the ground, not only the feet.
+        ``scene_file``: the name of a file in the export, or the path of a user's scene, which changes ``contract``.
+        ``whole``: the whole body can touch the ground, not only the feet.
         ``change`` edits the model before the first step. ``each`` is called after every physics step; ``read_data``
-        then has the forces of that step. Raises ContractError.
+        then returns the forces of that step. Raises ContractError, and UserError for a user's scene.
         """
         scene, contract = enter_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
         if change:
             change(self.model)
-        # a broken world counts as fallen; nothing is printed
+        # a world with non-finite values counts as a fall; nothing is printed
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _keep_quiet()
         # the same check as in sim/engines.py
@@ -121,34 +121,34 @@ class Fleet:
         self._batch = Batch(self.model, count, threads or min(usable_cores(), count), persistent=each is not None)
         self._each = each
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
-        # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
+        # (N, nq) view: position [m], quaternion, joints in MuJoCo's order
         self.qpos: Floats = self._batch.bind("qpos")
-        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written here
+        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv) view; the next step starts from the written values
         self._forces: Floats = self._batch.bind("qfrc_actuator")  # (N, nv) of the last physics step
         self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
         self._where, self._contacts = scene.sensordata, scene.contacts
-        # (N,) MuJoCo could not step the robot, since its reset
+        # (N,) true if MuJoCo failed to step the robot since its reset
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
-        # (N, D) [rad] or [N m] what the motors get before a robot's first target; newest first, one a period
+        # (N, D) [rad] or [N m] targets before the first action; `_sent`: targets of the last periods, newest first
         self._start = np.tile(
             0.0 if contract.action.origin in ("torque", "speed") else contract.default_pose, (count, 1)
         )
         self._sent = self._start[None].copy()
-        self._late = np.zeros(count, dtype=int)  # (N,) physics steps from `write` to the motors
+        self._late = np.zeros(count, dtype=int)  # (N,) delay from `write` to the motors, in physics steps
         # index of each joint in qpos
         self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]
         self.reset()
 
     def read(self) -> Measurement:
-        """Measurement of every robot, (N, ...) each, copied."""
+        """The measurement of every robot, (N, ...) each. The arrays are copies."""
         values = {name: self._value(name) for name in self._layout}
         return Measurement(
             **{n: values[n] for n in QUANTITIES}, others={n: v for n, v in values.items() if n not in QUANTITIES}
         )
 
     def write(self, targets: Floats) -> None:
-        """Step every robot by one period with servo targets (N, D) [rad], or torques [N m]."""
+        """Advance every robot by one period with servo targets (N, D) [rad], or torques [N m]."""
         self._ctrl[:, self._actuators] = targets
         if not self._network and not self._each and not self._late.any():
             self._step(self.contract.decimation, _NOW)
@@ -167,31 +167,31 @@ class Fleet:
             self.refresh()
 
     def motor_torque(self) -> Floats:
-        """(N, D) [N m] of each motor in the last physics step; a servo's damping is its own, not the joint's."""
+        """(N, D) [N m] torque of each motor in the last physics step, including a servo's damping."""
         damping = self.contract.damping if self.damps_by_joint else 0.0
         return self._forces[:, self._dofs] - damping * self.qvel[:, self._dofs]
 
     def motor_speed(self) -> Floats:
-        """(N, D) [rad/s]"""
+        """(N, D) [rad/s] speed of each joint."""
         return self.qvel[:, self._dofs].copy()
 
     def _arrived(self, step: int) -> Floats:
-        """What the motors (N, D) have in this physics step of a period."""
+        """The targets (N, D) that the motors have received in this physics step of a period."""
         age = np.maximum(self._late - step + self.contract.decimation - 1, 0) // self.contract.decimation
         return self._sent[age, np.arange(self.count)]
 
     def read_data(self, data: mujoco.MjData, world: int = 0) -> None:
-        """Copy one robot's data into ``data``; its forces are those of the last physics step if ``each`` was given."""
+        """Copy one robot's data into ``data``. With ``each`` it has the forces of the last physics step."""
         self._batch.get_data(world, data)
 
     def _step(self, count: int, stage: int) -> None:
         try:
             self._batch.step(nstep=count, stage=stage)
-        except SimulationError as error:  # the other worlds are stepped all the same
+        except SimulationError as error:  # the other worlds have been stepped
             self.broken[error.ids] = True
 
     def fell(self) -> NDArray[np.bool_]:
-        """Robots (N,) that fell by the contract's `ends`, or with a state that is not finite."""
+        """(N,) true for a fall by the contract's `ends` or a state that is not finite."""
         ends = self.contract.ends
         fell = ends.tilted(self._value("gravity")) | ~np.isfinite(self.qvel).all(axis=1) | self.broken
         if ends.min_base_height is not None:
@@ -199,7 +199,7 @@ class Fleet:
         return fell | (self._sensors[:, self._where[FALL]] > 0.0).any(axis=1) if ends.falls_on else fell
 
     def touching(self) -> NDArray[np.bool_]:
-        """Foot geoms on the ground (N, G), in the order of their sensors."""
+        """(N, G) true for a foot geom on the ground, in the order of their sensors."""
         where = sorted({int(place) for places in self._contacts for place in places})
         return self._sensors[:, where] > 0.0
 
@@ -208,7 +208,7 @@ class Fleet:
         self._batch.forward(stage=_NOW)
 
     def reset(self, which: Any = None) -> None:
-        """Put the robots ``which`` (indices; None: all) into the first keyframe, at rest."""
+        """Reset the robots ``which`` (indices; None: all) to the first keyframe, at rest."""
         which = np.arange(self.count) if which is None else np.asarray(which)
         self._batch.reset(which, keyframe=0, stage=_NOW)
         self.broken[which] = False
@@ -219,9 +219,9 @@ class Fleet:
     def set_gains(self, stiffness: Floats, damping: Floats) -> None:
         """Set the servo gains of every robot: (D,) [N m/rad] and (D,) [N m s/rad], in the contract's order.
 
-        Damping is clipped to half of inertia / timestep, the most that these physics steps can integrate.
-        Real drives run faster.
-        Motors that are not servos keep the scene's gains; without stiffness they are off.
+        Damping is clipped to half of inertia / timestep, because more is unstable at this time step.
+        Real drives use a shorter time step.
+        Motors that are not servos keep the scene's gains. If the stiffness is zero, they are switched off.
         """
         scene, dofs, motors = self.model.dof_damping[self._dofs].ravel(), self._dofs, self.contract.motors
         stable = np.maximum(scene, 0.5 / (self.model.dof_invweight0[dofs] * self.contract.timestep))
@@ -237,13 +237,13 @@ class Fleet:
         self._batch.expand("dof_damping")[:, dofs] = np.minimum(damping, stable) if off else scene
 
     def set_delay(self, seconds: Floats) -> None:
-        """Delay what each robot's motors get, (N,) [s]; rounded up to whole physics steps."""
+        """Delay the targets of each robot's motors by (N,) [s], rounded up to whole physics steps."""
         self._late = np.ceil(seconds / self.model.opt.timestep - 1e-6).astype(int)
         periods = 1 + -(-int(self._late.max()) // self.contract.decimation)
         self._sent = np.repeat(self._start[None], periods, axis=0)
 
     def scale_gains(self, factor: Floats) -> None:
-        """Multiply each robot's stiffness and damping by its ``factor`` (N,); the torque of motors without gains."""
+        """Multiply each robot's stiffness and damping by ``factor`` (N,). Motors without gains: their torque."""
         law, shape = self.contract.motors.law, (-1, 1)
         gains = {"servo": (0,), "dc_motor": (DC_STIFFNESS, DC_DAMPING)}.get(law, ())
         for column in gains:
@@ -257,18 +257,18 @@ class Fleet:
 
     @property
     def damps_by_joint(self) -> bool:
-        """Whether the servos' damping is the joints', as in an export's scene; in a user's it is the actuators'."""
+        """True if the joints have the servos' damping, as in an export. In a user's scene the actuators have it."""
         return self.contract.motors.law == "servo" and not self.model.actuator_biasprm[self._actuators, 2].any()
 
     def add_load(self, body: int, mass: Floats) -> None:
-        """Add ``mass`` (N,) [kg] to ``body`` of each robot, and inertia in proportion."""
+        """Add ``mass`` (N,) [kg] to ``body`` of each robot. Its inertia is scaled in proportion."""
         ratio = 1.0 + mass / self.model.body_mass[body]
         self._batch.expand("body_mass")[:, body] *= ratio
         self._batch.expand("body_inertia")[:, body] *= ratio[:, None]
         self._batch.set_const()
 
     def set_friction(self, friction: Floats) -> None:
-        """Set the sliding friction of all contacts of each robot, (N,); NaN: the scene's."""
+        """Set the sliding friction (N,) of all contacts of each robot; NaN: the scene's."""
         given = np.isfinite(friction)
         self._batch.expand("geom_friction")[given, :, 0] = friction[given, None]
         if self.model.npair:
@@ -287,7 +287,7 @@ class Fleet:
         return self._sensors[:, self._where[name]]
 
     def _gravity(self) -> Floats:
-        """Gravity's direction (N, 3), body frame. On a slope it leans towards the world's x axis."""
+        """Direction of gravity (N, 3), body frame. A simulated slope tilts gravity towards the world's x axis."""
         up, (x, _, z) = (
             self._sensors[:, self._where["up"]],
             self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity),
@@ -307,9 +307,9 @@ class Fleet:
         return np.clip(self._heights(px, py) - standing, -1.0, 1.0)
 
     def _heights(self, px: ArrayLike, py: ArrayLike) -> Floats:
-        """Height (N, points) [m] of each root above the ground at points ahead and to the left; inf without ground.
+        """Height (N, points) [m] of each root above the ground, at points ``px`` ahead and ``py`` to the left [m].
 
-        Rays from above find the ground: they see geom group 0 only.
+        Rays from above measure it. They hit geom group 0 only. Without ground the height is inf.
         """
         px, py, root, (w, x, y, z) = np.asarray(px), np.asarray(py), self.qpos[:, :3], self.qpos[:, 3:7].T
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))[:, None]
@@ -334,9 +334,9 @@ class MujocoRobot(Robot):
         hoisted: bool = False,
         lift: float = 0.0,
     ) -> None:
-        """Load the robot. ``whole``: its whole body can touch the ground.
+        """Load the robot. ``whole``: the whole body can touch the ground.
 
-        ``hoisted``: the base hangs ``lift`` [m] above its start until ``write`` is called without gains.
+        ``hoisted``: the base hangs ``lift`` [m] above its start position until ``write`` is called without gains.
         """
         self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
@@ -362,7 +362,7 @@ class MujocoRobot(Robot):
         self._move(self._targets, 0.0 * self._gains[0], 0.0 * self._gains[1])
 
     def lower(self) -> None:
-        """Put it on the ground if it hangs above; one with two feet goes on hanging there."""
+        """Lower a hanging robot to the ground. A robot with two feet stays on the hoist."""
         if self.hoisted:
             self._start[2], self._lift = self._start[2] - self._lift, 0.0
             self.fleet.qpos[0, :7], self.fleet.qvel[0, :6] = self._start, 0.0
@@ -370,7 +370,7 @@ class MujocoRobot(Robot):
             self.hoisted = len(self.fleet.contract.feet) == 2
 
     def close(self) -> None:
-        """Damp the joints from now on, even after a later ``write``."""
+        """Damp the joints until the end. A later ``write`` does not change the gains."""
         self._set(0.0 * self._gains[0], damped(self.fleet.contract))
         self._closed = True
 
@@ -395,18 +395,18 @@ class MujocoRobot(Robot):
 
 
 def _keep_quiet() -> None:
-    """Stop MuJoCo from printing and from writing a log file. A broken world is counted instead."""
+    """Stop MuJoCo from printing and from writing a log file. ``Fleet.broken`` counts the errors."""
     config = mujoco.MjLogConfig.get()
     config.logto_console = config.logto_file = False
     config.set()
 
 
-# ---- the scene -----------------------------------------------------------------------------------------------------
+# ---- scene ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class DeployScene:
-    """The robot in MuJoCo, and the indices of its names."""
+    """The robot's model in MuJoCo, and the indices of the contract's names."""
 
     spec: mujoco.MjSpec
     model: mujoco.MjModel  # compiled from `spec`
@@ -417,7 +417,7 @@ class DeployScene:
 
 
 def enter_scene(folder: Path, contract: Contract, file: str | Path, whole: bool) -> tuple[DeployScene, Contract]:
-    """The scene, and the contract in it. Raises ContractError, and UserError for a user's scene that does not fit."""
+    """The scene, and the contract for it. Raises ContractError, and UserError for a user's scene that does not fit."""
     if isinstance(file, str):
         return read_scene(folder, contract, file, whole), contract
     spec, contract = fit(file, folder, contract, lowest_point)
@@ -427,9 +427,9 @@ def enter_scene(folder: Path, contract: Contract, file: str | Path, whole: bool)
 def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> DeployScene:
     """Load ``file`` of an export and check that it is the contract's robot. Raises ContractError.
 
-    ``whole``: every body with collision shapes (group 3) can touch the ground, and the solver has MuJoCo's own
-    iterations, for a lying robot. Training leaves most bodies out and stops after the first iterations. Bodies with
-    contacts, such as feet, stay unchanged.
+    ``whole``, for a lying robot: every body with collision shapes (group 3) can touch the ground, and the solver uses
+    MuJoCo's default iterations. Training has contacts of few bodies and fewer iterations. Bodies that have contacts,
+    such as feet, stay unchanged.
     """
     if file == TERRAIN_FILE and not ((folder / file).is_file() and (contract.terrain or not contract.scene)):
         raise ContractError(
@@ -446,7 +446,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
         check_model(model)
         _check_start(spec, model)
         if whole:
-            model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
+            model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's defaults
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
     scene = _find_all(spec, model, file, contract)
@@ -457,7 +457,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
 
 
 def _find_all(spec: mujoco.MjSpec, model: mujoco.MjModel, file: str, contract: Contract) -> DeployScene:
-    """Joints, servos and sensors by name."""
+    """Find joints, servos and sensors by name."""
     joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]
     actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
     needed = [*SENSED, *([FALL] if contract.ends.falls_on else [])]
@@ -479,8 +479,8 @@ def _find_all(spec: mujoco.MjSpec, model: mujoco.MjModel, file: str, contract: C
 
 
 def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Raise ValueError if the first keyframe is no place to start from."""
-    # otherwise the model's keyframe, from `size nkey`, has straight legs
+    """Raise ValueError if the first keyframe is not a valid start pose."""
+    # without it, `size nkey` gives the model a keyframe of straight legs
     if not spec.keys or not len(spec.keys[0].qpos):
         raise ValueError("it has no keyframe; the first one says where the robot starts")
     if not np.any(model.opt.gravity):
@@ -512,7 +512,7 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
 
 
 def _places(model: mujoco.MjModel, file: str, sensors: Sequence[str], what: str) -> np.ndarray:
-    """Indices in sensordata of ``sensors``, side by side."""
+    """Indices in sensordata of all values of ``sensors``."""
     spans = []
     for name in sensors:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)

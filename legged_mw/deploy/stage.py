@@ -1,4 +1,4 @@
-"""An export's robots as a stage: a viewer can show and drive them, one control step at a time."""
+"""The robots of an export as a stage: a viewer can show them and step them by one control period."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Change, Fleet
 
-SCATTER = 0.05  # [rad] largest difference of a joint from its start, where a seed asks for it [ours]
-STROLL = {"lin_vel_x": 0.5}  # [m/s] without a command: a walking robot shows more than a standing one
+SCATTER = 0.05  # [rad] largest random change of a joint's start angle [ours]
+STROLL = {"lin_vel_x": 0.5}  # [m/s] default command, because a walking robot shows more than a standing robot
 
 
 def idle_command(contract: Contract) -> Floats:
-    """The command (C,) of a robot without a user: a stroll if it is trained to walk, else the defaults."""
+    """The command (C,) without a user: STROLL if the policy is trained to walk, else the defaults."""
     return contract.held([STROLL.get(command.name, command.default) for command in contract.commands])
 
 
@@ -44,9 +44,9 @@ class DeployStage:
     ) -> None:
         """Load the export in ``folder``.
 
-        ``scene_file``: see Fleet. ``command`` (C,) applies when ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
-        ``change``, ``whole`` and ``each``: see Fleet. ``edited``: see read_contract.
-        ``contact``: the policy sees the velocity of leg odometry with this contact detection; None: the true velocity.
+        ``scene_file``, ``change``, ``whole``, ``each``: see Fleet. ``edited``: see read_contract.
+        ``command`` (C,) applies if ``step`` gets none. ``ends`` replaces the contract's rules for a fall.
+        ``contact``: the source of foot contact for leg odometry, whose velocity the policy gets; None: true velocity.
         """
         contract = read_contract(folder, edited)
         self.fleet = Fleet(
@@ -61,11 +61,11 @@ class DeployStage:
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()
         self._fell = np.zeros(num_worlds, dtype=bool)
-        self.disturb: Callable[[Measurement], Measurement] | None = None  # what the policy measures -> what it sees
-        self.measured = self._seen = self.fleet.read()  # after the last step; as the policy saw it
+        self.disturb: Callable[[Measurement], Measurement] | None = None  # applied to the policy's measurement
+        self.measured = self._seen = self.fleet.read()  # after the last step; input of the policy in the last step
 
     def step(self, commands: Floats | None = None) -> None:
-        """Run one period with ``commands`` (N, C), or the default ones. A robot that falls starts again."""
+        """Run one period with ``commands`` (N, C); None: the default commands. A robot that falls is reset."""
         self._commands = (
             self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
         )
@@ -84,11 +84,11 @@ class DeployStage:
         return self._commands.copy()
 
     def velocity(self) -> Floats:
-        """(N, 3) vx, vy [m/s] of the IMU and yaw rate [rad/s], body frame."""
+        """(N, 3) vx and vy of the IMU [m/s], yaw rate [rad/s], body frame."""
         return np.concatenate([self.measured.lin_vel[:, :2], self.measured.ang_vel[:, 2:]], axis=1)
 
     def believed_velocity(self) -> Floats | None:
-        """(N, 2) vx, vy [m/s] from leg odometry, else from the policy at its last step; None without an estimate."""
+        """(N, 2) vx, vy [m/s] of leg odometry, else of the policy's last estimate; None without an estimate."""
         estimate = self._seen.lin_vel if self.odometry else self.controller.estimate("base_lin_vel")
         return None if estimate is None else estimate[:, :2]
 
@@ -97,41 +97,41 @@ class DeployStage:
         return self.fleet.qpos.copy()
 
     def ghost(self) -> Floats | None:
-        """The frame (N, nq) that each robot follows, if it follows a motion."""
+        """The reference frame (N, nq) of each robot; None without a reference motion."""
         return self.controller.follower.ghost() if self.controller.follower else None
 
     def contacts(self) -> NDArray[np.bool_]:
-        """(N, G) True for a foot geom on the ground."""
+        """(N, G) true for a foot geom on the ground."""
         return self.fleet.touching()
 
     def fell(self) -> NDArray[np.bool_]:
-        """(N,) True for a fall in the last step."""
+        """(N,) true for a fall in the last step."""
         return self._fell.copy()
 
     def ground(self, world: int) -> str:
-        """Always empty: a scene has no names for its ground."""
+        """Always empty, because a scene has no name for its ground."""
         return ""
 
     def push(self, world: int, velocity: Any) -> None:
-        """Add ``velocity`` (2,) [m/s, world frame] to the base velocity. The policy sees it a step later."""
+        """Add ``velocity`` (2,) [m/s, world frame] to the base velocity. The policy measures it one step later."""
         self.fleet.qvel[world, :2] += velocity
 
     def put(self, qpos: Floats, qvel: Floats) -> None:
-        """Put all robots into these states, (N, nq) and (N, nv), and start them again."""
+        """Set all robots to ``qpos`` (N, nq) and ``qvel`` (N, nv), and reset their policies."""
         self.fleet.qpos[:], self.fleet.qvel[:] = qpos, qvel
         self.fleet.refresh()
         self._forget(slice(None))
         self.measured = self.fleet.read()
 
     def scatter(self, seed: int) -> None:
-        """Turn each joint by up to SCATTER, drawn from ``seed``, and start again. Seed 0: nothing moves."""
+        """Change each joint angle by up to SCATTER, drawn from ``seed``, and reset the policies. Seed 0: no change."""
         if seed:
             joints = self.fleet.qpos.shape[1] - 7
             turned = np.random.default_rng(seed).uniform(-SCATTER, SCATTER, (self.num_worlds, joints))
             self.put(self.qpos() + np.pad(turned, ((0, 0), (7, 0))), self.fleet.qvel.copy())
 
     def reset(self, world: int) -> None:
-        """Put the robot back to the start, at rest."""
+        """Reset the robot to its start pose, at rest."""
         self.fleet.reset([world])
         self._forget([world])
         self.measured = self.fleet.read()

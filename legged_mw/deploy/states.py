@@ -1,9 +1,9 @@
-"""The states of a robot, and the buttons between them.
+"""The states of a robot, and the buttons that change them.
 
 zero torque -> (start) -> stand -> (A) -> policy -> (select, a fall, a trip) -> damping -> (start) -> zero torque.
 
-A person changes the state by a remote, a gamepad or keys; only damping can begin by itself.
-The caller passes times in: nothing waits here.
+A person changes the state with a remote, a gamepad or keys. Only damping can begin without a person.
+The caller passes the times. This module does not wait.
 """
 
 from __future__ import annotations
@@ -25,40 +25,41 @@ ZERO, STAND, POLICY, DAMPING, CHECK, CHIRP = STATES = (
     *("zero torque", "stand", "policy"),
     *("damping", "joint check", "chirp"),
 )
-ARMED = (STAND, POLICY, CHECK, CHIRP)  # states with limits; in the others no motor pushes
-RISE = 2.0  # [s] of standing up, from any pose to the default pose [unitree_rl_gym]
+ARMED = (STAND, POLICY, CHECK, CHIRP)  # states with limits; in the others the motors have no stiffness
+RISE = 2.0  # [s] duration of standing up, from any pose to the default pose [unitree_rl_gym]
 SOFT = 0.1  # [share of the stiffness] at the start of standing up
-NEAR = 0.15  # [rad] ours: a joint farther from the pose after RISE carries weight and gets stiffer
-# [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times the gain of go2_flat
+NEAR = 0.15  # [rad] ours: if a joint is farther from the pose after RISE, the stiffness of all joints is raised
+# [share of the stiffness] upper bound; unitree_rl_lab stands a Go2 with 60 N m/rad, three times the gain of go2_flat
 STIFFEST = 3.0
 STIFFEN = 1.0  # [share of the stiffness per second]
-# IMU check while the robot stands up. Ours: the shipped Go1 and Go2 tilt by 0.1 rad in all. With right axes gyro and
-# legs differ from gravity by 0.05 of the tilt, with wrong axes by 0.7.
-TILTS, MISSED = 0.03, 0.6  # [rad] least tilt for a check; share of it that may differ
-TURN = 5  # measurements per mean: single ones are noisy, and their times are not exact
+# IMU check while the robot stands up. Ours: the shipped Go1 and Go2 tilt by 0.1 rad in total. With right axes the tilt
+# by gyro or legs differs from the tilt by gravity by a share of 0.05, with wrong axes by 0.7.
+TILTS, MISSED = 0.03, 0.6  # [rad] smallest tilt for a check; largest allowed difference, share of the tilt
+TURN = 5  # measurements per mean; single measurements are noisy, and their times are not exact
 # [rad] roll to each side while standing up, with three feet or more; largest joint motion for it
 SWAY, BEND = 0.06, 0.15
-# [deg] between gravity and the legs' estimate of it: the steepest ground to start on, encoder offsets included
+# [deg] largest angle between gravity and the legs' estimate of it; it includes the slope and encoder offsets
 STEEP = 25.0
-PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and accelerometer; [m/s^2] range for a robot at rest
-STANDS = 0.3  # [rad] from the pose, at most, to start a policy; ours: the shipped policies walk off from there
+PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] angle between gravity and accelerometer; [m/s^2] its range for a robot at rest
+STANDS = 0.3  # [rad] largest distance from the pose to start a policy; ours: the shipped policies walk from there
 
 
 _IMU = ("ang_vel", "gravity", "acceleration")
-KEPT = 125  # measurements kept while standing up: 2.5 s, since a gyro's bias adds up
+KEPT = 125  # stored measurements while standing up: 2.5 s, because a gyro's bias accumulates
 
 
 def _in_turns(values: Floats) -> Floats:
-    """Means (N // TURN, 3) over TURN rows of ``values`` (N, 3): less noise, and inexact times matter less."""
+    """Means (N // TURN, 3) over TURN rows of ``values`` (N, 3). They reduce noise and errors of the times."""
     return values[: len(values) // TURN * TURN].reshape(-1, TURN, 3).mean(axis=1)
 
 
 def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
-    """What is wrong with the IMU's axes, from one measurement a period; "" if nothing, or if too little moved.
+    """Check the IMU's axes from one measurement per period.
 
-    Gravity must turn as the gyro says, and at rest point against the accelerometer. Two faults pass both
-    checks: all sensors of the IMU are turned in the same way, or all swap the same axes and nothing tilts along the
-    third. ``at_odds`` finds those.
+    Returns the fault in words; "" if there is none, or if the robot moved too little.
+    Gravity must rotate as the gyro measures, and at rest point against the accelerometer. Two faults pass both
+    checks: all sensors of the IMU are rotated in the same way, or all swap the same axes and nothing tilts along the
+    third. ``at_odds`` detects these.
     """
     if len(seen) <= TURN:
         return ""
@@ -76,11 +77,11 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
 
 
 def at_odds(legs: Floats, gravity: Floats) -> str:
-    """Compare measured ``gravity`` (N, 3), one a period, with the estimate of the ``legs`` (N, 3).
+    """Compare measured ``gravity`` (N, 3), one per period, with the estimate of the ``legs`` (N, 3).
 
-    Returns the difference in words; "" if they agree, or if too little is known.
-    A slope shifts the two by a constant. Pitch and roll must therefore change alike, and the shift must not exceed the
-    steepest slope.
+    Returns the difference in words; "" if they agree, or if there are too few estimates.
+    On a slope the two differ by a constant. Pitch and roll must therefore change equally, and the constant must not
+    exceed STEEP.
     """
     known = np.isfinite(legs).all(axis=1)
     if known.sum() < TURN:
@@ -100,7 +101,7 @@ class Order(NamedTuple):
     """The command to the servos for the next period."""
 
     state: str
-    # (D,) [rad] before clipping, for the limits to check; None: limp in ZERO, damped in DAMPING
+    # (D,) [rad] before clipping, so that the limits check them; None: zero torque in ZERO, damped in DAMPING
     targets: Floats | None = None
     stiffness: Floats | None = None  # (D,); None: the contract's
     damping: Floats | None = None  # (D,); None: the contract's
@@ -109,12 +110,12 @@ class Order(NamedTuple):
 class States:
     """The states of one robot. Input sources, limits and falls change them.
 
-    ``command`` returns (C,) at a time [s] since the policy began; it applies while no source drives.
-    ``say`` gets a line for each change.
+    ``command`` returns (C,) at a time [s] since the policy began. It applies while no input source gives a command.
+    ``say`` gets one line for each change.
     """
 
-    first = STAND  # the state that the start button begins
-    over, report, right = False, "", True  # true if the run ends now; text at its end, and whether that is good
+    first = STAND  # the state after the start button
+    over, report, right = False, "", True  # true if the run ends now; text at the end; true if the result is good
 
     def __init__(
         self,
@@ -124,12 +125,12 @@ class States:
         say: Callable[[str], None] = print,
     ) -> None:
         self.controller, self.sources, self._own, self._say = controller, list(sources), command, say
-        self.state, self.since = ZERO, 0.0  # [s] begin of the state
+        self.state, self.since = ZERO, 0.0  # state; [s] time at which it began
         self.command = controller.contract.held(command(0.0))  # (C,) command in use
         self.note = f"{START}: {self.first}"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] pose at the start of standing up
         self._stiffer = 1.0
-        # measurements since standing up began; the legs' estimate of gravity in each
+        # measurements while standing up; the legs' estimate of gravity in each
         self._rise, self._down = list[Measurement](), list[Floats]()
         self._legs, self._sway = None, np.zeros(len(self._from))  # (D,) [rad] amplitude of the sway
         if len(controller.contract.feet) > 2:
@@ -144,7 +145,7 @@ class States:
         return self.state in ARMED
 
     def listen(self, health: Health, now: float) -> Trip | None:
-        """Poll all input sources. Returns a trip for an emergency stop."""
+        """Poll all input sources and set the command. Returns a trip for an emergency stop."""
         wishes = [source.poll(health) for source in self.sources]
         driving = next((i for i, wish in enumerate(wishes) if wish.command is not None), None)
         if driving is None:
@@ -159,7 +160,7 @@ class States:
         return Trip("stop", stop) if stop and self.state != DAMPING else None
 
     def step(self, measured: Measurement, now: float) -> Order:
-        """Change the state by the pressed buttons; returns the servos' order."""
+        """Change the state by the pressed buttons. Returns the command to the servos."""
         self._move_on(measured, now)
         if self.state == STAND:
             return self._stand(measured, now)
@@ -169,17 +170,17 @@ class States:
         return Order(self.state)
 
     def trip(self, trip: Trip, now: float) -> Order:
-        """A limit was passed: damp until a person starts the robot again."""
+        """Damp the robot until a person starts it again."""
         if self.state != DAMPING:
             self._enter(DAMPING, now, trip.text)
         return Order(DAMPING)
 
     def close(self) -> None:
-        """Release keys and files."""
+        """Close all input sources."""
         for source in self.sources:
             source.close()
 
-    # ---- the changes
+    # ---- state changes
 
     def _move_on(self, measured: Measurement, now: float) -> None:
         pressed = self._pressed
@@ -195,7 +196,7 @@ class States:
             self._begin(measured, now)
 
     def _begin(self, measured: Measurement, now: float) -> None:
-        """Start the policy if the robot stands."""
+        """Start the policy if the robot stands and the IMU check finds no fault."""
         contract = self.controller.contract
         off = np.abs(measured.joint_pos - contract.default_pose)
         if now - self.since < RISE or contract.ends.tilted(measured.gravity) or off.max() > STANDS:
@@ -214,9 +215,9 @@ class States:
         self._enter(POLICY, now, f"{END}: damping")
 
     def _stand(self, measured: Measurement, now: float) -> Order:
-        """Go straight to the default pose with rising gains. If a joint lags behind, all gains rise further.
+        """Interpolate to the default pose and raise the gains. If a joint stays behind, raise all gains further.
 
-        In the second half a robot with three feet or more sways to both sides, so that its IMU is seen to roll.
+        In the second half a robot with three feet or more rolls to both sides, so that the IMU check measures a roll.
         """
         contract = self.controller.contract
         if len(self._rise) < KEPT:

@@ -1,10 +1,10 @@
-"""A scene of the user's, such as a vendor's own MJCF, made into one that an export can run in.
+"""Convert a user's scene, such as a vendor's MJCF, so that an export can run in it.
 
-Joints are found by name. Its actuators are replaced by position servos with the contract's gains and the torque limits
-of the file, else of the export; the sensors of the contract are added. Euler gives way to implicitfast: vendors' joints
-may have no inertia of their own, and a servo's damping, which Euler integrates explicitly, would throw them about.
-Masses, contacts, joint friction, solver and time step stay. The file is read as every stranger's:
-``legged_mw.robot.mjcf`` refuses what no robot needs, and nothing in it is run.
+Joints are found by name. Position servos with the contract's gains replace the actuators; their torque limits are the
+file's, else the export's. The contract's sensors are added. The integrator implicitfast replaces Euler: Euler
+integrates a servo's damping explicitly, which is unstable for a joint without armature.
+Masses, contacts, joint friction, solver and time step stay. The file is not trusted:
+``legged_mw.robot.mjcf`` refuses elements that no robot needs, and nothing in the file is run.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import UserError, unknown
 
 HOME = "home"  # keyframe with the start pose
-_LOW = 0.01  # [m] of a foot's body: what reaches down to within this of its lowest point is the foot
+_LOW = 0.01  # [m] a geom of the foot's body belongs to the foot if it ends this close to the lowest point
 _OBJECT, _SENSOR = mujoco.mjtObj, mujoco.mjtSensor
 Lowest = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
 
 
 def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[mujoco.MjSpec, Contract]:
-    """The scene in ``file`` for the export in ``folder``, and its contract there: time step, mass, sensors and feet.
+    """The scene in ``file`` for the export in ``folder``, and the contract with its time step, mass, sensors and feet.
 
-    ``lowest``: height of a geom's lowest point [m]. Raises UserError.
+    ``lowest`` returns the height of a geom's lowest point [m]. Raises UserError.
     """
     if not file.is_file():
         raise UserError(f"--scene: no file {file}")
@@ -69,7 +69,7 @@ def _in_scene(
     sensors: dict[str, tuple[str, ...]],
     feet: dict[str, tuple[str, ...]],
 ) -> Contract:
-    """The contract with what is the scene's."""
+    """The contract with the scene's time step, mass, sensors and feet."""
     steps = contract.period / model.opt.timestep
     if steps < 0.999 or abs(steps - round(steps)) > 1e-3:
         raise UserError(
@@ -91,15 +91,15 @@ def _in_scene(
         mass=float(model.body_subtreemass[0]),
         sensors=sensors,
         feet=feet,
-        ends=contract.ends._replace(falls_on=()),  # geoms of another file
+        ends=contract.ends._replace(falls_on=()),  # the names are geoms of another file
     )
 
 
-# ---- the robot ------------------------------------------------------------------------------------------------------
+# ---- robot ----------------------------------------------------------------------------------------------------------
 
 
 def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Remove the file's actuators and keyframes. Return joint -> highest torque [N m], of those that state one."""
+    """Remove the file's actuators and keyframes. Returns joint -> largest torque [N m], where an actuator states it."""
     found: dict[str, float] = {}
     for actuator in list(spec.actuators):
         gear = abs(float(actuator.gear[0]))
@@ -109,7 +109,7 @@ def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
         elif actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and control[1] > control[0]:
             found[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
         spec.delete(actuator)
-    for key in list(spec.keys):  # with a control for each actuator
+    for key in list(spec.keys):  # a keyframe has a control for each actuator
         spec.delete(key)
     spec.nkey = 0
     return found
@@ -118,7 +118,7 @@ def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
 def _missing_limits(
     spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract, stated: dict[str, float]
 ) -> dict[str, float]:
-    """The export's torque limits [N m] of those joints for which the file states none."""
+    """Joint -> the export's torque limit [N m], for joints without a limit in the file."""
     here, exported = (
         torque_limits(model, [model.joint(name).id for name in contract.joints]) for model in (spec.compile(), own)
     )
@@ -131,7 +131,7 @@ def _missing_limits(
 
 
 def torque_limits(model: mujoco.MjModel, joints: Sequence[int]) -> Floats:
-    """(D,) [N m] the lowest limit of each joint: its own, or its actuator's; infinite without one."""
+    """(D,) [N m] the smaller torque limit of each joint and its actuator; inf without a limit."""
     found = np.where(model.jnt_actfrclimited[joints] > 0, np.abs(model.jnt_actfrcrange[joints]).max(axis=1), np.inf)
     for i, joint in enumerate(joints):
         for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
@@ -142,7 +142,7 @@ def torque_limits(model: mujoco.MjModel, joints: Sequence[int]) -> Floats:
 
 
 def _find_joints(spec: mujoco.MjSpec, file: Path, contract: Contract) -> None:
-    """Raise UserError unless the file has one floating robot with exactly the joints of the contract."""
+    """Raise UserError unless the file has one robot with a free root and exactly the contract's joints."""
     names = [joint.name for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
     for name in contract.joints:
         if name not in names:
@@ -161,7 +161,7 @@ def _find_joints(spec: mujoco.MjSpec, file: Path, contract: Contract) -> None:
 
 
 def _root(spec: mujoco.MjSpec, contract: Contract) -> mujoco.MjsBody:
-    """The body of the world that carries the joints."""
+    """The robot's root: the child of the world that carries the joints."""
     body = spec.joint(contract.joints[0]).parent
     while body.parent.name != "world":
         body = body.parent
@@ -169,7 +169,7 @@ def _root(spec: mujoco.MjSpec, contract: Contract) -> mujoco.MjsBody:
 
 
 def _make_ready(spec: mujoco.MjSpec, contract: Contract, limits: dict[str, float]) -> None:
-    """Servos by the contract's gains, a ground where there is none, groups as a height scan wants them."""
+    """Add servos with the contract's gains, add a ground if there is none, and set geom groups for a height scan."""
     if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for i, name in enumerate(contract.joints):
@@ -192,13 +192,13 @@ def _make_ready(spec: mujoco.MjSpec, contract: Contract, limits: dict[str, float
     if not world:
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         spec.worldbody.add_geom(name="floor_of_deploy", type=plane, size=[0.0, 0.0, 0.05], contype=1, conaffinity=1)
-    for geom in spec.geoms:  # a height scan sees group 0 alone
+    for geom in spec.geoms:  # a height scan detects group 0 only
         ground = geom.parent.name == "world"
         geom.group = 0 if ground else geom.group or 1
 
 
 def _find_imu(spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract) -> str:
-    """The IMU's site: the file's of that name, else one at its place on the body of the same name, else on the root."""
+    """The IMU's site in the file. If it is missing, add it to the body of the export's name, else to the root."""
     if spec.site(contract.imu) is not None:
         return contract.imu
     site = own.site(contract.imu)
@@ -211,7 +211,7 @@ def _find_imu(spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract) -> s
 
 
 def _stand(spec: mujoco.MjSpec, contract: Contract, lowest: Lowest) -> None:
-    """Add the keyframe: upright, in the default pose, the lowest point at the height 0."""
+    """Add a keyframe: upright, in the default pose, with the lowest point at height 0."""
     model = spec.compile()
     data = _posed(model, contract)
     touching = np.flatnonzero((model.geom_conaffinity | model.geom_contype > 0) & (model.geom_bodyid > 0)).tolist()
@@ -230,7 +230,7 @@ def _posed(model: mujoco.MjModel, contract: Contract) -> mujoco.MjData:
 def _find_feet(
     spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract, lowest: Lowest
 ) -> dict[str, tuple[str, ...]]:
-    """Foot -> its contact sensors. A foot is what reaches lowest of all that the same joint moves as in the export."""
+    """Foot -> its contact sensors. A foot is the lowest geoms of the bodies that the foot's joint moves."""
     model, feet = spec.compile(), {}
     data = _posed(model, contract)
     for foot, sensors in contract.feet.items():
@@ -249,7 +249,7 @@ def _find_feet(
 
 
 def _feel(spec: mujoco.MjSpec, geom: int, name: str) -> str:
-    """Add a sensor of the contacts of a geom with the ground, and return its name."""
+    """Add a sensor for contacts of a geom with the ground. Returns its name."""
     felt: Any = spec.geoms[geom]
     felt.name = felt.name or name
     spec.add_sensor(
@@ -259,13 +259,13 @@ def _feel(spec: mujoco.MjSpec, geom: int, name: str) -> str:
         objname=felt.name,
         reftype=_OBJECT.mjOBJ_BODY,
         refname="world",
-        intprm=[1, 0, 1],  # the number of contacts found
+        intprm=[1, 0, 1],  # it measures the number of contacts
     )
     return name
 
 
 def _add_sensors(spec: mujoco.MjSpec, contract: Contract, imu: str) -> dict[str, tuple[str, ...]]:
-    """Quantity -> sensors, added under names of their own."""
+    """Add the contract's sensors with new names. Returns quantity -> sensors."""
     site, joint, found = _OBJECT.mjOBJ_SITE, _OBJECT.mjOBJ_JOINT, {}
 
     def add(quantity: str, kind: Any, of: Any, *names: str, **more: Any) -> None:
