@@ -1,4 +1,4 @@
-"""The table of exams, the look-up of a task's exam, and ``play.py --eval``: grade one policy or two, write the report."""
+"""The table of exams, the exam of a task, and ``play.py --eval``, which grades policies and writes a report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from legged_mw.utils.task import LoadedTask
 
 
 class Examiner(Protocol):
-    """The exam during training: a call with a policy returns figures by name."""
+    """The exam during training. A call with a policy returns figures by name."""
 
     env: RobotTask
     advice: list[str]  # lines on the policy that was graded last
@@ -39,9 +39,9 @@ class Exam(NamedTuple):
     """One kind of exam. Its result and its figures are dicts of JSON values."""
 
     sets: Callable[[LoadedTask], set[str]]  # config fields that the user may not override
-    prepare: Callable[[LoadedTask], None]  # turns a task into the exam
+    prepare: Callable[[LoadedTask], None]  # changes a task's config to that of the exam
     make_room: Callable[[LoadedTask], None]  # sets the number of worlds again, after the user's overrides
-    ask_alike: Callable[[Sequence[LoadedTask]], None]  # grades all prepared tasks by the rules of the first
+    ask_alike: Callable[[Sequence[LoadedTask]], None]  # gives all prepared tasks the rules of the first
     # environment of the prepared task, policy -> result, figures
     examine: Callable[[Any, Policy], tuple[dict[str, Any], dict[str, Any]]]
     rules: Callable[[LoadedTask], ExamRules | Skill]  # of a prepared task, also for another physics engine
@@ -54,7 +54,7 @@ class Exam(NamedTuple):
 
 
 def _skill(kind: str) -> Exam:
-    """The exam for one kind of ``SKILLS``."""
+    """The exam of one kind of ``SKILLS``."""
     return Exam(
         sets=lambda task: {*perform.overrides(task), "env.num_envs"} - {"domain_rand.enable"},
         prepare=perform.prepare,
@@ -101,9 +101,9 @@ def require_exam(task: LoadedTask) -> Exam:
 
 
 def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner | None:
-    """The exam during the training in ``env``; None if the task has none.
+    """The exam during training in ``env``; None if the task has none.
 
-    Also None, with a printed reason, if the policy cannot read the observations of the exam's nominal world.
+    Also None, with a printed reason, if the observations of the exam's nominal world have another size.
     """
     if not (kind := find_exam(task)):
         return None
@@ -135,9 +135,9 @@ Elsewhere = Callable[[Graded], list[Column]]
 
 
 def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namespace, elsewhere: Elsewhere) -> None:
-    """Grade policies, each with its trained config. Print their tables and write a report next to the first.
+    """Grade policies, each with its trained config. Print their tables and write a report next to the first policy.
 
-    ``elsewhere`` grades the first policy again on another physics engine, by the hard exam too.
+    ``elsewhere`` grades the first policy on another physics engine, also with the hard exam.
     """
     device = pick_device(args.device)
     first, *rivals = policies
@@ -158,33 +158,33 @@ def grade(policies: list[tuple[PolicySource, LoadedTask]], args: argparse.Namesp
 
 
 def prepare(source: PolicySource, trained: LoadedTask, args: argparse.Namespace, common: bool = False) -> Graded:
-    """The trained task with the overrides of the exam, then those of the user.
+    """The trained task with the exam's overrides, then the user's.
 
-    ``common``: use the one command range in which all published policies of the robot were measured.
+    ``common``: use the command range in which all published policies of the robot were measured.
     """
     task, exam = copy.deepcopy(trained), require_exam(trained)
     exam.prepare(task)
     override(task, args, exam.sets(task))
     if common:
         task.update({"exam": in_common(getattr(getattr(task.cfg, "exam", None), "peer", ""))}, where="--ranges common")
-    exam.make_room(task)  # after the user's overrides: they may change the ranges
+    exam.make_room(task)  # the user's overrides can change the ranges
     return Graded(source, trained, task, exam, prepare_crossing(trained, args))
 
 
 def prepare_crossing(trained: LoadedTask, args: argparse.Namespace) -> LoadedTask | None:
-    """The rough part of the exam with the user's overrides; None if the policy trained on a plane."""
+    """The task of the exam's rough part with the user's overrides; None if the policy was trained on a plane."""
     crossing = require_exam(trained).rough
     if not crossing or trained.to_dict()["terrain"].get("mesh_type", "plane") == "plane":
         return None
     task = copy.deepcopy(trained)
     crossing.prepare(task)
     override(task, args, crossing.SETS)
-    crossing.make_room(task)  # after the user's overrides: they may change the kinds of terrain
+    crossing.make_room(task)  # the user's overrides can change the kinds of terrain
     return task
 
 
 def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None:
-    """Apply the user's overrides. Refuse an override of a field that the exam ``sets``."""
+    """Apply the user's overrides. Raises ConfigError for a field that the exam ``sets``."""
     before = copy.deepcopy(task)
     apply_overrides(task, args)
     check_classes(task.train)
@@ -195,7 +195,7 @@ def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None
 
 
 def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, RobotTask, RobotTask | None]:
-    """Build the policy, the environment of the exam, and that of the rough part."""
+    """Build the policy, the exam's environment, and the environment of its rough part, if there is one."""
     task, rough = graded.task, graded.crossing
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)

@@ -1,7 +1,7 @@
-"""The report's figures from a record: numpy arrays in, plain numbers out. No simulator, no drawing.
+"""Compute the report's figures from a record, as plain numbers. This module neither simulates nor draws.
 
-N worlds, T control steps, D joints, F feet. A world that fell is None and is left out of every mean here. The exam's
-means in ``walking`` count it. ``settled`` is the first control step after the exam's settling time.
+N worlds, T control steps, D joints, F feet. A world that fell is None and is excluded from every mean here. The exam's
+means in ``walking`` include it. ``settled`` is the first control step after the exam's settling time.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 from legged_mw.eval.walking import GRAVITY, PUSH_DIRECTIONS, SLOW
 
 SATURATED = 0.98  # share of the limit: a larger torque counts as saturated
-STRAY = 0.3  # share of the step: tolerance for being at its start or at its end
-SHORT_SWING = 2  # [control steps] shortest swing; a shorter time in the air is chatter of the contact
-BINS = 40  # of a joint's histogram
+STRAY = 0.3  # [share of the step] tolerance of the velocity at the start and at the end
+SHORT_SWING = 2  # [control steps] shortest swing; a shorter time in the air is contact chatter
+BINS = 40  # bins of a joint's histogram
 
 Array = NDArray[Any]
 
 
 class Record(NamedTuple):
-    """N worlds over T control steps. Signals are sampled before each step, so the first sample is the start state."""
+    """N worlds over T control steps. Signals are sampled before each step. The first sample is the start state."""
 
     dt: float  # [s] control step
     mass: float  # [kg]
     commands: Array  # (T, N, C)
-    fell_at: Array  # (N,) control step of the first fall, or inf; later samples are of another episode
+    fell_at: Array  # (N,) control step of the first fall, or inf; later samples belong to another episode
     last_position: Array  # (N, 2) [m] of the base after the last step
     signals: dict[str, Array]  # name -> (T, N, ...)
 
@@ -41,7 +41,7 @@ class Record(NamedTuple):
         )
 
 
-# ---- following the command
+# ---- velocity tracking
 
 
 def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[float | None]]]:
@@ -56,7 +56,7 @@ def step_response(time: Array, measured: Array, start: float, target: float) -> 
     """The response of ``measured`` (T,) to a command that steps from ``start`` to ``target`` at time 0.
 
     ``rise_time``: from 10 to 90 % of the step [s]. ``overshoot``: beyond the target, as a share of the step.
-    Both are None if ``measured`` does not begin near the start or does not settle near the target.
+    Both are None if ``measured`` does not begin near ``start`` or does not settle near ``target``.
     ``left``: mean difference to the target in the last half second, in the unit of ``measured``.
     """
     way = (measured - start) / (target - start)
@@ -82,9 +82,9 @@ def _first_crossing(time: Array, values: Array, level: float) -> float | None:
 
 
 def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
-    """The response along one axis of worlds that get the same command from step ``begin`` on.
+    """The velocity response along one axis. From step ``begin`` all worlds have the same command.
 
-    Returns the command, and mean, lowest and highest velocity over time. Worlds that fall are left out.
+    Returns the command, and the mean, smallest and largest velocity over time. Worlds that fall are left out.
     """
     commanded, stood = record.commands[begin:, 0, axis], np.isinf(record.fell_at)
     moved = record.signals["velocity"][begin:, stood, axis].astype(float)
@@ -98,7 +98,7 @@ def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
 
 
 def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any]]:
-    """The response to each change of the command, up to the next change."""
+    """The response to each change of the command, until the next change."""
     borders = [*(np.flatnonzero(np.diff(commanded)) + 1), len(time)]
     found = []
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
@@ -116,7 +116,7 @@ def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any
 def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: float) -> dict[str, Any]:
     """True and estimated vx, vy [m/s] in the last ``seconds`` of each command, joined in time (2, T).
 
-    None where the world fell.
+    None if the world fell.
     """
     last = round(seconds / record.dt)
     found: dict[str, Any] = {"commands": [list(command) for command in commands], "seconds": last * record.dt}
@@ -127,11 +127,11 @@ def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: floa
     return found
 
 
-# ---- the gait
+# ---- gait
 
 
 def duty_factor(contact: Array) -> list[float]:
-    """The share of time that each foot is in contact; ``contact`` (T, F)."""
+    """(F,) share of time in which each foot is in contact; ``contact`` (T, F)."""
     return contact.mean(axis=0, dtype=float).tolist()
 
 
@@ -150,7 +150,7 @@ def stride_frequency(contact: Array, dt: float) -> float:
 
 
 def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], seconds: float) -> list[dict[str, Any]]:
-    """For each command: duty factor, stride frequency, and the contacts (F, T) in the last ``seconds``."""
+    """For each command: duty factors, stride frequency, and the contacts (F, T) in the last ``seconds``."""
     found = []
     for world, command in enumerate(commands):
         contact, fell = record.signals["contact"][settled:, world], bool(np.isfinite(record.fell_at[world]))
@@ -207,7 +207,7 @@ def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]])
 
 
 def survival(fell_at: Array, until: int) -> list[list[bool]]:
-    """Whether each pushed robot still stood at step ``until``: speeds x directions."""
+    """True for each pushed robot that had not fallen at step ``until``: speeds x directions."""
     return (fell_at > until).reshape(-1, PUSH_DIRECTIONS).tolist()
 
 
@@ -241,16 +241,16 @@ def plain(values: Array) -> list[Any]:
     return [float(v) if math.isfinite(v) else None for v in values]
 
 
-# ---- motors: torque against speed of each kind of joint, inside the torque-speed envelope
+# ---- motors: torque and speed of each kind of joint, and the torque-speed envelope
 
 
-MOTOR_BINS = (40, 32)  # of speed and torque
-NEAR = 0.02  # share of the highest torque: a sample this close to the envelope counts as at the limit
+MOTOR_BINS = (40, 32)  # bins of speed and torque
+NEAR = 0.02  # [share of the largest torque] a sample this close to the envelope counts as at the limit
 MARGIN = 1.08  # size of the plot relative to samples and envelope
 
 
 class MotorLimits(NamedTuple):
-    """The motors' limits, each (D,); infinite where unknown."""
+    """The motors' limits, each (D,); infinite if unknown."""
 
     low: Array  # [N m]
     high: Array  # [N m]
@@ -258,7 +258,7 @@ class MotorLimits(NamedTuple):
     no_load_speed: Array  # [rad/s]
 
     def at(self, speed: Array) -> tuple[Array, Array]:
-        """Lowest and highest torque at ``speed`` (..., D)."""
+        """Smallest and largest torque [N m] at ``speed`` (..., D) [rad/s]."""
         share = speed / self.no_load_speed
         return np.maximum(self.low, -self.stall_torque * (1.0 + share)), np.minimum(
             self.high, self.stall_torque * (1.0 - share)

@@ -1,4 +1,4 @@
-"""The hard exam: conditions that a robot brings, how the walk looks, and the marks of "ready for a robot". Numpy alone.
+"""The hard exam: conditions of a real robot, figures of the walk, and the marks of "ready for a robot". Numpy only.
 
 ``legged_mw.deploy.hard_exam`` runs it on an export. Shapes: T physics steps, P control steps, D joints, F feet.
 """
@@ -17,27 +17,27 @@ from legged_mw.eval.walking import AXES, COMMON, LOADS, PEERS, ExamRules, Figure
 
 Array = NDArray[Any]
 
-# ---- the conditions -------------------------------------------------------------------------------------------------
+# ---- conditions -----------------------------------------------------------------------------------------------------
 
 
-SECONDS, SETTLING = 6.0, 2.0  # [s] of a command, and at its start without a measure
-# Push k of the 32 comes at PUSH_AT + k control steps; survived if the robot stands at the end, 3 s later at 50 Hz.
+SECONDS, SETTLING = 6.0, 2.0  # [s] duration of a command; time at its start that is not measured
+# Push k of 32 is at PUSH_AT [s] + k control steps. It is survived if the robot stands at the end, 3 s later at 50 Hz.
 PUSH_AT, PUSH_DIRECTIONS = 2.3, 32
 PUSH_BIPED, PUSH_OTHERS = 2.0, 3.0  # [m/s] jump of the base's horizontal velocity
-LOAD = 0.175  # share of the robot's mass, where no load is known that published policies carried
-# Half widths of uniform noise on what the policy measures [ours: about twice a good sensor's]
+LOAD = 0.175  # [share of the robot's mass] load, if the load of published policies is unknown
+# Half ranges of uniform noise on the policy's measurements [ours: about twice a good sensor's]
 NOISE = {"ang_vel": 0.2, "gravity": 0.05, "joint_pos": 0.01, "joint_vel": 1.5}
 
 
 class Condition(NamedTuple):
-    """What is unlike the nominal robot."""
+    """The differences from the nominal robot."""
 
     name: str
     delay: float = 0.0  # [ms] from the measurement to the servos' target
-    gains: float = 1.0  # factor on stiffness and damping; on the torque of motors without gains
-    loaded: bool = False  # the load at the trunk
-    friction: float | None = None  # of all contacts; None: the scene's
-    noisy: bool = False  # NOISE
+    gains: float = 1.0  # factor of stiffness and damping; of the torque for motors without gains
+    loaded: bool = False  # true: load on the trunk
+    friction: float | None = None  # [-] of all contacts; None: the scene's
+    noisy: bool = False  # true: NOISE
 
 
 ALL = "all"
@@ -55,7 +55,7 @@ CONDITIONS = (
 
 
 def commands(rules: ExamRules) -> list[Velocity]:
-    """The twelve commands; the first is standing. A side that the range does not have is left out."""
+    """The twelve commands (vx, vy, yaw rate); the first is to stand. Duplicates of a one-sided range are left out."""
     (x0, x1), (y0, y1), (w0, w1) = rules.ranges
     alone = [(x1 / 2, 0.0, 0.0), (x1, 0.0, 0.0), (x0, 0.0, 0.0)]
     alone += [(0.0, y, 0.0) for y in (y1, y0)] + [(0.0, 0.0, w) for w in (w1, w0)]
@@ -65,26 +65,26 @@ def commands(rules: ExamRules) -> list[Velocity]:
 
 
 def half_speed(rules: ExamRules) -> float:
-    """vx [m/s] of a robot that is pushed and looked at: half of the highest."""
+    """vx [m/s] during pushes and for the figures of the walk: half of the largest vx."""
     return round(rules.ranges[0][1] / 2, 4)
 
 
 def push_speed(feet: int) -> float:
-    """[m/s]"""
+    """Jump of the base velocity [m/s] at a push, for a robot with ``feet`` feet."""
     return PUSH_BIPED if feet == 2 else PUSH_OTHERS
 
 
 def load_of(rules: ExamRules, mass: float) -> float:
-    """The load [kg] for a robot of ``mass`` [kg]: the one that its published policies carried, else LOAD of its mass."""
+    """The load [kg] of a robot of ``mass`` [kg]: the load of its published policies, else LOAD * mass."""
     return LOADS.get(rules.peer, round(LOAD * mass, 2))
 
 
 def grade_condition(rules: ExamRules, velocity: Array, position: Array, fell_at: Array, dt: float) -> dict[str, Any]:
-    """Falls, errors, drift and pushes survived under one condition.
+    """Falls, tracking errors, drift and survived pushes under one condition.
 
-    The worlds are those of ``commands``, then the pushes. ``velocity`` (P, N, 3) [m/s, m/s, rad/s], ``position``
-    (P, N, 2) [m], before each of P control steps of ``dt`` [s]. ``fell_at`` (N,): control step of the first fall, or
-    inf. A command at which the robot falls has the error of standing still.
+    The first worlds have ``commands``, the others have pushes. ``velocity`` (P, N, 3) [m/s, m/s, rad/s] and
+    ``position`` (P, N, 2) [m] are sampled before each of P control steps of ``dt`` [s]. ``fell_at`` (N,): control step
+    of the first fall, or inf. If the robot falls, the error of the command is that of standing still.
     """
     asked = np.array(commands(rules))
     count, settled = len(asked), round(SETTLING / dt)
@@ -100,40 +100,40 @@ def grade_condition(rules: ExamRules, velocity: Array, position: Array, fell_at:
     }
 
 
-# ---- how it looks ---------------------------------------------------------------------------------------------------
+# ---- figures of a walk ----------------------------------------------------------------------------------------------
 
 
-AT_LIMIT = 0.02  # of a joint's range: nearer to its ends, or beyond them, counts as at the limit
-DOWN = 0.02  # body weights: a foot with less force on it is in the air [ours: 0.3 kg of a Go2]
-SHORT = 0.04  # [s] a shorter time in the air is chatter of the contact
-TOUCHDOWN = 0.06  # [s] after a touchdown, in which the foot hits the ground
-FAST = 10.0  # [Hz] a motor follows slower targets; faster ones are noise and heat
+AT_LIMIT = 0.02  # [share of a joint's range] a smaller distance to the end counts as at the limit
+DOWN = 0.02  # [body weights] a foot with less force is in the air [ours: 0.3 kg of a Go2]
+SHORT = 0.04  # [s] a shorter time in the air is contact chatter
+TOUCHDOWN = 0.06  # [s] time after a touchdown in which the impact force is measured
+FAST = 10.0  # [Hz] a motor cannot follow faster targets; they are noise and heat
 
 
 class Walk(NamedTuple):
-    """A robot that walks straight ahead, sampled at each physics step, without the settling time."""
+    """The record of a robot that walks straight ahead, sampled at each physics step, without the settling time."""
 
     dt: float  # [s] physics step
     period: float  # [s] control step
     weight: float  # [N]
-    tilt: Array  # (T, 2) [rad] the trunk's roll and pitch
-    sideways: Array  # (T, F) [m] place of each foot, to the left of the root
-    height: Array  # (T, F) [m] of each foot's lowest point above the ground
+    tilt: Array  # (T, 2) [rad] roll and pitch of the trunk
+    sideways: Array  # (T, F) [m] position of each foot, to the left of the root
+    height: Array  # (T, F) [m] height of each foot's lowest point above the ground
     sole: Array | None  # (T, F) [rad] tilt of each sole; None: point feet
     force: Array  # (T, F) [N] on each foot
     angle: Array  # (T, D) [rad]
-    target: Array  # (P, D) [rad] the policy's own, before any clamp
+    target: Array  # (P, D) [rad] the policy's targets before clipping
     torque: Array  # (T, D) [N m]
     speed: Array  # (T, D) [rad/s]
     low: Array  # (D,) [rad] ends of the joints' ranges; infinite without a range
     high: Array  # (D,) [rad]
-    limit: Array  # (D,) [N m] torque limits; infinite where unknown
+    limit: Array  # (D,) [N m] torque limits; infinite if unknown
     joints: Sequence[str]
-    clock: float | None  # [1/s] strides of the policy's gait clock
+    clock: float | None  # [1/s] stride frequency of the policy's gait clock
 
 
 def looks(walk: Walk) -> dict[str, Any]:
-    """All figures of the walk: angles in degrees, lengths in m, forces in body weights."""
+    """All figures of the walk: angles [deg], lengths [m], forces [body weights]."""
     down = on_ground(walk.force / walk.weight, walk.dt)
     every = round(walk.period / walk.dt)
     left = walk.sideways.mean(axis=0) > 0.0
@@ -167,7 +167,7 @@ def looks(walk: Walk) -> dict[str, Any]:
 
 
 def on_ground(force: Array, dt: float) -> NDArray[np.bool_]:
-    """(T, F) True for a foot that carries more than DOWN; ``force`` (T, F) in body weights. Chatter is filled in."""
+    """(T, F) true for a foot on the ground; ``force`` (T, F) [body weights]. Contact chatter is removed."""
     down = force > DOWN
     for foot in range(down.shape[1]):
         for start, end in spans(~down[:, foot]):
@@ -177,13 +177,13 @@ def on_ground(force: Array, dt: float) -> NDArray[np.bool_]:
 
 
 def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First index, and index after the last, of each run of True in ``mask`` (T,)."""
+    """The first index and the index after the last of each run of true values in ``mask`` (T,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def hits(force: Array, down: NDArray[np.bool_], dt: float) -> list[float]:
-    """The highest force in TOUCHDOWN after each touchdown of each foot; all of it must be in the record."""
+    """The largest force within TOUCHDOWN after each touchdown of each foot. Touchdowns near the end are left out."""
     length, found = round(TOUCHDOWN / dt), []
     for foot in range(force.shape[1]):
         starts = [start for start, _ in spans(down[:, foot]) if 0 < start <= len(force) - length]
@@ -192,7 +192,7 @@ def hits(force: Array, down: NDArray[np.bool_], dt: float) -> list[float]:
 
 
 def clearances(height: Array, down: NDArray[np.bool_]) -> list[float]:
-    """The highest height [m] of each foot in each whole swing, above its mean height on the ground."""
+    """The largest height [m] of each foot in each complete swing, above its mean height in stance."""
     found = []
     for foot in range(height.shape[1]):
         if not down[:, foot].any():
@@ -204,14 +204,17 @@ def clearances(height: Array, down: NDArray[np.bool_]) -> list[float]:
 
 
 def at_limit(values: Array, walk: Walk) -> Array:
-    """(D,) Share of time that ``values`` (T, D) are within AT_LIMIT of the ends of the range, or beyond them."""
+    """(D,) share of time in which ``values`` (T, D) are within AT_LIMIT of an end of the range, or beyond it."""
     known = np.isfinite(walk.low) & np.isfinite(walk.high)
     margin = np.where(known, AT_LIMIT * (np.where(known, walk.high, 0.0) - np.where(known, walk.low, 0.0)), 0.0)
     return ((values <= walk.low + margin) | (values >= walk.high - margin)).mean(axis=0)
 
 
 def fast_share(target: Array, period: float) -> float | None:
-    """Share of the power of ``target`` (P, D) above FAST, its mean left out, under a Hann window; None if it rests."""
+    """Share of the spectral power of ``target`` (P, D) above FAST, without the mean, with a Hann window.
+
+    None if the target is constant.
+    """
     moving = (target - target.mean(axis=0)) * np.hanning(len(target))[:, None]
     power = np.abs(np.fft.rfft(moving, axis=0)) ** 2
     above = np.fft.rfftfreq(len(target), period) > FAST
@@ -220,7 +223,7 @@ def fast_share(target: Array, period: float) -> float | None:
 
 
 def _sway(angle: Array) -> dict[str, float | None]:
-    """Mean, and half of the way from the lowest to the highest."""
+    """The mean, and half of the difference between the largest and the smallest value."""
     return {"mean": _number(angle.mean()), "amplitude": _number((angle.max() - angle.min()) / 2)}
 
 
@@ -230,7 +233,7 @@ def _worst(share: Array, joints: Sequence[str]) -> dict[str, Any]:
 
 
 def _worst_mean(angle: Array | None, down: NDArray[np.bool_]) -> float | None:
-    """Of the feet's mean angles while on the ground the largest; None without soles, or if no foot is ever down."""
+    """The largest of the feet's mean angles in stance; None without soles or stance."""
     if angle is None or not down.any():
         return None
     return _number(max(angle[down[:, foot], foot].mean() for foot in range(angle.shape[1]) if down[:, foot].any()))
@@ -244,16 +247,16 @@ def _number(value: Any) -> float | None:
     return round(float(value), 5) if math.isfinite(value) else None
 
 
-# ---- published policies that were measured alike -----------------------------------------------------------------------
+# ---- published policies with the same measurements -----------------------------------------------------------------
 
 
-BETTER = ("target_step", "fast_share", "hit", "hardest_hit", "torque_over_limit")  # figures of a walk: less is better
+BETTER = ("target_step", "fast_share", "hit", "hardest_hit", "torque_over_limit")  # figures for which less is better
 
 
 def beside(rules: ExamRules) -> dict[str, Any]:
-    """Names of the published policies of this robot with a hard exam, and the best of each figure of theirs.
+    """The names of this robot's published policies with a hard exam, and their best value of each figure.
 
-    ``errors`` of a condition only where the range is theirs; ``pushes`` and ``looks`` where the speed is. Empty without any.
+    ``errors`` needs equal command ranges; ``pushes`` and ``looks`` need an equal speed. Empty without such policies.
     """
     measured = {peer.name: peer.hard for peer in PEERS.get(rules.peer, []) if peer.hard}
     common = COMMON.get(rules.peer)
@@ -272,14 +275,15 @@ def beside(rules: ExamRules) -> dict[str, Any]:
     }
 
 
-# ---- the marks ------------------------------------------------------------------------------------------------------
+# ---- marks ----------------------------------------------------------------------------------------------------------
 
 
-PUSHES, LIMITS, TORQUE, TRUNK, SOLES = 0.9, 0.01, 0.4, 5.0, 3.0  # at least; at most: share, share, share, [deg], [deg]
+# PUSHES: smallest share; LIMITS, TORQUE: largest share; TRUNK, SOLES: largest tilt [deg]
+PUSHES, LIMITS, TORQUE, TRUNK, SOLES = 0.9, 0.01, 0.4, 5.0, 3.0
 
 
 def trunk(found: Mapping[str, Any]) -> float:
-    """[deg] The largest tilt of the trunk: of roll and pitch, the mean and the amplitude together."""
+    """[deg] largest tilt of the trunk: |mean| + amplitude, the larger of roll and pitch."""
     return max(abs(found[axis]["mean"]) + found[axis]["amplitude"] for axis in ("roll", "pitch"))
 
 
@@ -291,7 +295,7 @@ def finish(
     feet: int,
     load: float,
 ) -> dict[str, Any]:
-    """The result of the hard exam. ``found``: of ``looks``; None if the robot fell while it was looked at."""
+    """The result of the hard exam. ``found``: the return value of ``looks``; None if the robot fell in that walk."""
     result: dict[str, Any] = {
         "ready": False,
         "misses": [],
@@ -310,7 +314,7 @@ def finish(
 
 
 def misses(result: Mapping[str, Any]) -> list[str]:
-    """What keeps the policy from a robot, in words; empty if it is ready."""
+    """The missed marks in words; empty if the policy is ready for a robot."""
     conditions, found = result["conditions"], result["looks"]
     said = [] if result["walks"] else ["does not walk by the walking exam"]
     fallen = ["nominal conditions" if name == "none" else name for name, each in conditions.items() if each["falls"]]
@@ -331,7 +335,7 @@ def misses(result: Mapping[str, Any]) -> list[str]:
 
 
 def figures(result: Mapping[str, Any]) -> list[Figure]:
-    """The rows of how it looks, with the marks."""
+    """The figures of the walk with their marks, as table rows."""
     found = result["looks"]
     if not found:
         return []
@@ -375,13 +379,13 @@ def figures(result: Mapping[str, Any]) -> list[Figure]:
 
 
 def peer_label(result: Mapping[str, Any]) -> str:
-    """The heading above the published policies' figures; empty without any."""
+    """The heading of the published policies' figures; empty without such policies."""
     count = len(result.get("peers", {}).get("policies", ()))
     return f"best of {count}" if count else ""
 
 
 def condition_rows(result: Mapping[str, Any]) -> list[list[str]]:
-    """A heading, then a row for each condition: name, falls, errors, drift, pushes; and the published policies' best."""
+    """A heading, and a row per condition: name, falls, errors, drift, pushes, best errors and pushes of peers."""
     names = ", ".join(name.removesuffix(" rate") for name, _ in AXES)
     rows = [["", "falls", f"error {names}", "drift [m]", f"pushes of {result['push_speed']:g} m/s"]]
     published = result.get("peers")

@@ -1,6 +1,6 @@
-"""Will it trip? Heat, limits and power of an export's motors: figures, verdict and words. Numpy alone.
+"""The heat exam: temperature, limits and power of an export's motors, as figures, verdict and text. Numpy only.
 
-``legged_mw.deploy.heat_exam`` records what is judged. Shapes: as in ``legged_mw.utils.motor_heat``, which has the model.
+``legged_mw.deploy.heat_exam`` records the motions. ``legged_mw.utils.motor_heat`` has the model and the shapes.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from legged_mw.utils.motor_heat import (
     settled,
 )
 
-AMBIENTS = (20.0, 40.0)  # [deg C] of the room, and of the winding at the start
-LOADED = 6  # rows of the text table: the motors that are loaded most
+AMBIENTS = (20.0, 40.0)  # [deg C] ambient temperatures, which the windings have at the start
+LOADED = 6  # rows of the text table, for the motors with the largest load
 THERMAL = ("motor_constant", "thermal_resistance", "thermal_time")
 
 # ---- figures of an export -------------------------------------------------------------------------------------------
 
 
 class Motion(NamedTuple):
-    """N robots that stand, walk or do what they are for, sampled at each physics step."""
+    """The record of N robots that stand, walk or perform their skill, sampled at each physics step."""
 
     torque: Floats  # (T, N, D) [N m]
     speed: Floats  # (T, N, D) [rad/s]
 
 
 class Switch(NamedTuple):
-    """From a stand in the default pose, held by the policy's gains, to the policy."""
+    """The switch to the policy from a stand in the default pose with the policy's gains."""
 
-    step: float  # [s] of the physics
-    jump: Floats  # (D,) [rad] from the pose to the policy's first target, before any clamp
-    before: Floats  # (D,) [N m] the last torque of the stand
-    after: Motion  # of one robot, from the policy's first target on
-    period: float  # [s] between two targets
+    step: float  # [s] physics step
+    jump: Floats  # (D,) [rad] from the pose to the policy's first target, before clipping
+    before: Floats  # (D,) [N m] last torque of the stand
+    after: Motion  # of one robot; it begins at the policy's first target
+    period: float  # [s] control step
 
 
 def phase(motion: Motion, ratings: Ratings, limit: Floats) -> dict[str, Any]:
-    """A motion's figures, lists (D,) in the order of the motors; None where unknown."""
+    """The figures of a motion, as lists (D,) in the order of the motors; None if unknown."""
     load, taken = rms(motion.torque), power(*motion, ratings)
     minutes = {f"{each:g}": seconds_until_hot(load, ratings, each) / 60.0 for each in AMBIENTS}
     return {
@@ -58,14 +58,14 @@ def phase(motion: Motion, ratings: Ratings, limit: Floats) -> dict[str, Any]:
         "of_rating": _plain(load / ratings.continuous_torque),
         "at_limit": _plain(at_limit(*motion, ratings, limit)),
         "settles": {f"{each:g}": _plain(settled(load, ratings, each)) for each in AMBIENTS},  # [deg C]
-        "minutes": {each: _plain(values) for each, values in minutes.items()},  # None where it never gets so hot, too
+        "minutes": {each: _plain(values) for each, values in minutes.items()},  # None also if never reached
         "mean_power": round(float(taken.mean()), 1),
         "peak_power": round(float(taken.max()), 1),
     }
 
 
 def switched(switch: Switch, ratings: Ratings, joints: Sequence[str]) -> dict[str, Any]:
-    """The jumps of target and torque within the first period, and the peak power with its duration at half of it."""
+    """The jumps of target and torque in the first control step, the peak power, and the time above half of it."""
     first = switch.after.torque[: max(1, round(switch.period / switch.step)), 0]
     change = np.abs(first - switch.before).max(axis=0)
     taken = power(*switch.after, ratings)[:, 0]
@@ -88,9 +88,9 @@ def finish(
     switch: Switch | None,
     switches: bool = False,
 ) -> dict[str, Any]:
-    """The result, for JSON. ``motions``: "standing", "walking" and so on; None: it fell. ``limit``: (D,) [N m].
+    """The result, for JSON. ``motions``: "standing", "walking" ...; None: the robot fell. ``limit``: (D,) [N m].
 
-    ``switches``: whether a switch was tried; the robot fell then if there is no ``switch``.
+    ``switches``: true if the switch was tested; then ``switch`` None means that the robot fell.
     """
     result: dict[str, Any] = {
         "joints": list(joints),
@@ -105,13 +105,13 @@ def finish(
 
 
 def unknown(ratings: Ratings) -> list[str]:
-    """Names of the ratings that a motor or the battery lacks, of those that say whether it trips."""
+    """The names of the ratings that the verdict needs and that are unknown for a motor or the battery."""
     heat = [name for name in ("continuous_torque", *THERMAL) if np.isnan(getattr(ratings, name)).any()]
     return [*heat, *([BATTERY] if math.isnan(ratings.battery_power) else [])]
 
 
 def reasons(result: Mapping[str, Any]) -> list[str]:
-    """Why it may trip, in words; empty if nothing that is known says so."""
+    """The reasons in words why the robot may switch off; empty if the known ratings give none."""
     found, most = [], result[BATTERY]
     for name, each in result["phases"].items():
         if not each:
@@ -136,13 +136,13 @@ def reasons(result: Mapping[str, Any]) -> list[str]:
 
 
 def _verdict(result: Mapping[str, Any]) -> bool | None:
-    """False if all that could trip is known, else None. The winding's figures or the continuous torque are enough."""
+    """False if all ratings are known, else None. For heat either THERMAL or the continuous torque is enough."""
     lacking = set(result["unknown"])
     heat = "continuous_torque" in lacking and bool(lacking & set(THERMAL))
     return None if heat or BATTERY in lacking or None in result["phases"].values() else False
 
 
-# ---- words ----------------------------------------------------------------------------------------------------------
+# ---- text -----------------------------------------------------------------------------------------------------------
 
 
 _UNKNOWN = "unknown"
@@ -152,7 +152,7 @@ LEAD = (
 
 
 def lines(result: Mapping[str, Any]) -> list[str]:
-    """One line each: heat, torque-speed limit, power, switch, verdict."""
+    """Lines on heat, torque-speed limit, power, switch and verdict."""
     said, names = [], result["joints"]
     for name, each in result["phases"].items():
         if not each:
@@ -173,14 +173,14 @@ def lines(result: Mapping[str, Any]) -> list[str]:
 
 
 def verdict(result: Mapping[str, Any]) -> str:
-    """Yes with the reasons, no, or unknown."""
+    """The verdict in words: yes with the reasons, no, or unknown."""
     if result["trips"]:
         return f"yes: {'; '.join(result['reasons'])}"
     return _UNKNOWN if result["trips"] is None else "no"
 
 
 def _heat_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
-    """Of the motor that is hot first, else of the one nearest to its rating, else to its torque limit."""
+    """Text on the first motor at HOT, else on the warmest winding, else on the motor nearest to its rating or limit."""
     cool = f"{AMBIENTS[0]:g}"
     if (hot := _least(each["minutes"][cool])) is not None:
         return f"{_short(result, hot)} reaches {HOT:g} C after {each['minutes'][cool][hot]:.0f} min at {cool} C"
@@ -215,7 +215,7 @@ def _power_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
 
 
 def rows(result: Mapping[str, Any], most: int | None = None) -> list[list[str]]:
-    """A heading, then a row a motor; with ``most`` only the motors that are loaded most. Unknown columns are left out."""
+    """A heading, and a row per motor. ``most``: only this many motors with the largest load. No unknown columns."""
     found = {name: each for name, each in result["phases"].items() if each}
     order = range(len(result["joints"]))
     if most is not None and found:

@@ -1,4 +1,4 @@
-"""Skill exams in the training environment: for ``--eval``, for the report, and during training."""
+"""Skill exams in the training environment, for ``--eval`` and during training."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NOMINAL: dict[str, Any] = {
 
 
 def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
-    """The exam of the given kind with the values of the task's config section ``exam``."""
+    """The exam ``kind`` with the values of the task's config section ``exam``."""
     return make_skill(kind, cfg.to_dict().get("exam", {}))
 
 
@@ -46,7 +46,7 @@ def overrides(task: LoadedTask) -> dict[str, Any]:
 
 
 def prepare(task: LoadedTask) -> None:
-    """Turn ``task`` into the first part of its exam."""
+    """Change the config of ``task`` to that of the first part of its exam."""
     for path, value in overrides(task).items():
         task.set(path, value, where="exam")
     make_room(task)
@@ -58,7 +58,7 @@ def make_room(task: LoadedTask) -> None:
 
 
 def ask_alike(tasks: Sequence[LoadedTask]) -> None:
-    """Grade all prepared tasks by the config section ``exam`` of the first."""
+    """Give all prepared tasks the config section ``exam`` of the first."""
     for task in tasks[1:]:
         task.update({"exam": tasks[0].to_dict()["exam"]} if "exam" in tasks[0].to_dict() else {}, where="--compare")
 
@@ -66,7 +66,7 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
 def examine(kind: str, env: RobotTask, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     """The result and the pictures of the exam.
 
-    ``env`` comes from a prepared task and has the first ground. Each further ground builds another environment.
+    ``env`` is of a prepared task and has the first ground. For each other ground another environment is built.
     """
     skill, parts, strips = skill_of(env.cfg, kind), {}, {}
     for number, (name, ground) in enumerate(skill.grounds.items()):
@@ -79,7 +79,7 @@ def examine(kind: str, env: RobotTask, policy: Policy) -> tuple[dict[str, Any], 
 
 
 def _draw(env: RobotTask, strips: Mapping[str, np.ndarray]) -> dict[str, bytes]:
-    """A picture of each robot, or none on a machine that cannot draw."""
+    """One picture strip per robot; none if the machine cannot draw."""
     try:
         return {name: strip(env, qpos) for name, qpos in strips.items()}
     except UserError as error:
@@ -120,7 +120,7 @@ def perform(
     ground: ExamGround = ExamGround(),  # noqa: B008
     starts: Starts | None = None,
 ) -> Recording:
-    """Put each robot into its start state and run ``policy``. ``starts``: start states that are already computed."""
+    """Set each robot to its start state and run ``policy``. ``starts``: precomputed start states."""
     env.reset()
     if starts := starts or skill.starts(machine(env), env.num_envs):
         for state, values in zip((env.sim.qpos, env.sim.qvel), starts, strict=True):
@@ -148,7 +148,7 @@ def perform(
 
 
 class InTraining:
-    """The first part of the exam during training. ``rollout.TrainingExam`` does the same for the walking exam."""
+    """The first part of the exam during training. ``rollout.TrainingExam`` is its counterpart for the walking exam."""
 
     def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
         copied = rollout.copy_of(task)
@@ -157,7 +157,7 @@ class InTraining:
         with rollout.keep_random_state(device):
             self.env = copied.env_class(copied.cfg, device, eager=eager)
         self._starts = self.skill.starts(machine(self.env), self.env.num_envs)
-        self.advice: list[str] = []  # the figures say it
+        self.advice: list[str] = []  # always empty
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """The figures of ``first_part``."""
@@ -166,7 +166,7 @@ class InTraining:
 
 
 def first_part(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> dict[str, float]:
-    """Figures by name of the part that ``env`` was prepared for. Figures without a value are left out."""
+    """The figures, by name, of the exam's part in ``env``. Figures without a value are left out."""
     found = skill.judge(machine(env), perform(env, policy, skill, starts=starts))
     return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
 
@@ -195,7 +195,7 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
-# ---- a picture strip of one robot, from left to right in time
+# ---- picture strip of one robot over time
 
 
 PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, pictures per row, [px] of each

@@ -1,7 +1,7 @@
-"""Draw the report's figures with matplotlib, each panel as an inline SVG. Computes no numbers.
+"""Draw the report's figures with matplotlib, each panel as an inline SVG. This module computes no figures.
 
-Every panel is a function of an Axes. The colours become CSS variables, and the page sets them for light and dark
-mode. The palette of Okabe and Ito is safe for colour-blind readers.
+Every panel is a function of an Axes. The colours become CSS variables, which the page sets for light and dark mode.
+The palette of Okabe and Ito is safe for colour-blind readers.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ STYLE: dict[Any, Any] = {
     **{"lines.linewidth": 1.4, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none"},
 }
 HEAT = "viridis"  # perceptually uniform
-GAITS = (1, 2, 3, 5, 7, 11)  # indices of the drawn commands: ahead at three speeds, back, left, turning left
+GAITS = (1, 2, 3, 5, 7, 11)  # indices of the drawn commands: three speeds ahead, one back, one left, one turn left
 
 
 class PlotPanel(NamedTuple):
@@ -94,7 +94,7 @@ class Section(NamedTuple):
 
 
 def sections(columns: Columns, rules: ExamRules) -> list[Section]:
-    """All sections for one or two policies, with the pass marks and the peer from the rules of the first."""
+    """All sections for one or two policies. ``rules`` of the first give the pass marks and the peer."""
     pushes = [PlotPanel(partial(_push_curve, columns, rules), height=2.9)]
     for which in ("walking", "standing"):
         for i, (name, figures) in enumerate(columns):
@@ -124,7 +124,7 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
 
 
 def svgs(section: Section) -> list[str]:
-    """The section's panels as inline SVG: no ids, no links, colours as CSS variables."""
+    """The section's panels as inline SVG, without ids and links, with colours as CSS variables."""
     drawn = []
     for i, panel in enumerate(section.panels):
         with rc_context({**STYLE, "svg.hashsalt": f"{section.name}{i}"}):
@@ -163,7 +163,7 @@ def _array(values: Any) -> np.ndarray:
 
 
 def _crossing_maps(columns: Columns) -> list[PlotPanel]:
-    """One map for each policy that was graded on rough terrain."""
+    """One map per policy that was graded on rough terrain."""
     graded = [(_of(name, columns), figures["crossing"]) for name, figures in columns if "crossing" in figures]
     kinds = max((len(result["kinds"]) for _, result in graded), default=0)
     width, height = 6.2 if len(graded) == 1 else 5.2, 0.75 + 0.43 * kinds
@@ -173,7 +173,7 @@ def _crossing_maps(columns: Columns) -> list[PlotPanel]:
 def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
     """Plot one row per kind of terrain and one cell per level, with the shares that crossed and that fell.
 
-    The text below the cells is the quantity that makes the kind hard.
+    The text below a cell is the terrain's size at this level, such as the height of a step.
     """
     for row, kind in enumerate(kinds.values()):
         shares = _array([kind["crossed"], kind["fell"]])
@@ -201,17 +201,17 @@ def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
 
 
 def _percent(share: float) -> str:
-    """Whole percent. Only a share of 1 is 100, only a share of 0 is 0."""
+    """Whole percent. Only a share of 1 gives 100, and only a share of 0 gives 0."""
     return "<1" if 0.0 < share < 0.01 else f"{min(round(100 * share), 99) if share < 1.0 else 100}"
 
 
-# ---- following the command
+# ---- velocity tracking
 
 
 def _heat_maps(columns: Columns, rules: ExamRules) -> list[PlotPanel]:
-    """Heat maps of three errors over two grids. A scale ends at the largest error, at most at three times its mark.
+    """Heat maps of three errors over two grids. A scale ends at the largest error, but at most at three times its mark.
 
-    If the marks are of offsets, the errors have no mark: the scale has no line and may be longer.
+    If the marks apply to offsets, the errors have no mark: the scale has no line and can be longer.
     """
     panels, strict = [], rules.marks_of == "error"
     marks = rules.marks if strict else [3 * mark for mark in rules.marks]
@@ -266,7 +266,7 @@ def _heat(
 
 
 def _edges(centres: np.ndarray) -> np.ndarray:
-    """The borders of cells from their centres."""
+    """The edges of cells from their centres."""
     half = np.diff(centres) / 2 if len(centres) > 1 else np.array([0.5])
     return np.concatenate([[centres[0] - half[0]], centres[:-1] + half[: len(centres) - 1], [centres[-1] + half[-1]]])
 
@@ -307,7 +307,7 @@ def _estimates(columns: Columns) -> list[PlotPanel]:
 
 
 def _estimate(estimate: Figures, k: int, colour: str, suffix: str, ax: Axes) -> None:
-    """Plot axis ``k`` of ``figures.estimates``, with the commands side by side."""
+    """Plot axis ``k`` of ``figures.estimates``, one command after the other."""
     commands, seconds = estimate["commands"], estimate["seconds"]
     for key, tone, label in (("truth", INK, "true"), ("estimate", colour, "estimated")):
         values = np.array(estimate[key][k], dtype=float).reshape(len(commands), -1)
@@ -331,7 +331,7 @@ def _estimate(estimate: Figures, k: int, colour: str, suffix: str, ax: Axes) -> 
 
 
 def _gait(columns: Columns, world: int, ax: Axes) -> None:
-    """Plot a bar while a foot is in contact. Two policies share the lane of each foot."""
+    """Plot a bar for each stance of a foot. Two policies share the row of each foot."""
     feet, count = columns[0][1]["foot_names"], len(columns)
     rows, height = [figures["gait"][world] for _, figures in columns], 0.62 / count
     for i, row in enumerate(rows):
@@ -361,7 +361,7 @@ def _joint_panels(columns: Columns) -> list[PlotPanel]:
 
 
 def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
-    """Plot one histogram per joint, all of equal height. Limits are vertical lines; a bar marks the middle 90 %."""
+    """Plot one histogram per joint, all of equal height. Vertical lines are limits. The text is the saturated share."""
     names = [name.removesuffix("_joint") for name in columns[0][1]["joint_names"]]
     for i, (_, figures) in enumerate(columns):
         found = figures["joints"][key]
@@ -386,7 +386,7 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
 
 
 def _motor_panels(columns: Columns) -> list[PlotPanel]:
-    """One panel per kind of joint and policy. Figures from older reports may lack them."""
+    """One panel per kind of joint and policy. Older reports do not have these figures."""
     rows = zip_longest(
         *([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns)
     )
@@ -396,7 +396,7 @@ def _motor_panels(columns: Columns) -> list[PlotPanel]:
 def _motor(motor: Figures, suffix: str, ax: Axes) -> None:
     """Plot the torque against the speed of one kind of joint."""
     counts, speeds, torques = (np.array(motor[key], dtype=float) for key in ("counts", "speeds", "torques"))
-    # only cells with samples: a full mesh would make a page of megabytes
+    # only cells with samples; a full mesh would make the page too large
     rows, columns = np.nonzero(counts)
     often = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
     ax.bar(
@@ -437,7 +437,7 @@ def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
 
 
 def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -> None:
-    """Plot one tile per push: ring by speed, sector by direction in the robot's frame, filled if survived."""
+    """Plot one tile per push, coloured if survived. Rings are speeds. Sectors are directions in the base frame."""
     survived = np.array(pushes[which])
     width = 2 * math.pi / survived.shape[1]
     rings, sectors = np.indices(survived.shape).reshape(2, -1)

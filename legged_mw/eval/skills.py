@@ -1,6 +1,6 @@
-"""The exams of tasks without commands: set the start states, run the policy, judge the recording.
+"""The exams of tasks without commands. They set the start states, run the policy and grade the recording.
 
-Each kind of exam is a ``Skill``. The same object judges the training environment and an exported policy. It needs
+Each kind of exam is a ``Skill``. The same object grades a policy in training and an exported policy. It needs
 numpy and MuJoCo, but neither torch nor warp.
 """
 
@@ -23,14 +23,14 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
 Floats = NDArray[np.float64]
-PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] golden angle: directions that never repeat
+PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] golden angle, so that no direction repeats
 Starts = tuple[Floats, Floats]  # qpos (N, nq), qvel (N, nv)
 
 
 class ExamGround(NamedTuple):
-    """The changes of one part of the exam to the trained task without randomization."""
+    """The changes of one part of the exam to the task without randomization."""
 
-    slope: float = 0.0  # [deg] of the plane; simulated by tilting gravity
+    slope: float = 0.0  # [deg] of the plane; gravity is tilted to simulate it
     friction: float | None = None  # [-] of the ground; None: as in the task
     load: float = 0.0  # [kg] payload on the root body
     push: float = 0.0  # [m/s] jump of each robot's horizontal velocity, every PUSH_EVERY seconds
@@ -52,8 +52,8 @@ class ReferenceMotion(NamedTuple):
     """The reference motion of a tracking exam."""
 
     qpos: Floats  # (T, nq) one frame per control step
-    bodies: tuple[str, ...]  # bodies to compare with the reference
-    anchor: str  # the body at which robot and reference are aligned
+    bodies: tuple[str, ...]  # tracked bodies
+    anchor: str  # body that aligns the robot with the reference
 
 
 class ExamRobot(NamedTuple):
@@ -61,29 +61,29 @@ class ExamRobot(NamedTuple):
 
     model: mujoco.MjModel  # model of the simulation, with the gravity of the exam's ground
     home: Floats  # (nq,) qpos at the start of an episode, joints in the default pose
-    dt: float  # [s] a control step
+    dt: float  # [s] control step
     motion: ReferenceMotion | None = None
 
 
 class Recording(NamedTuple):
-    """N robots over T control steps, sampled before each step: the first sample is the start state."""
+    """The record of N robots over T control steps, sampled before each step. The first sample is the start state."""
 
     qpos: Floats  # (T, N, nq) position [m, world frame], quaternion wxyz, joint angles [rad]
     qvel: Floats  # (T, N, nv)
     torque: Floats  # (T, N, D) [N m], one simulation step old
-    ended_at: Floats  # (N,) control step of the first end of an episode, or inf; later samples are of another one
+    ended_at: Floats  # (N,) control step at which the first episode ends, or inf; later samples are of another episode
 
     def alive(self) -> NDArray[np.bool_]:
-        """(T, N): the first episode has not ended."""
+        """(T, N) true if the first episode has not ended."""
         return np.arange(len(self.qpos))[:, None] <= self.ended_at
 
     def power(self) -> Floats:
-        """(T, N) [W]: the sum over the joints of |torque * speed|."""
+        """(T, N) [W] sum of |torque * speed| over the joints."""
         return np.abs(self.torque * self.qvel[..., 6:]).sum(axis=2)
 
 
 class Measure(NamedTuple):
-    """A figure of each part of an exam, with its pass marks on the task's own ground and on other grounds."""
+    """A figure of each part of an exam, with its pass marks on the first ground and on the other grounds."""
 
     key: str
     text: str  # label with unit
@@ -99,7 +99,7 @@ class Skill(ABC):
     kind: ClassVar[str]
     asks: ClassVar[str]  # description for the table, one sentence
     grounds: ClassVar[Mapping[str, ExamGround]]  # part -> ground; the first part is also the exam during training
-    robots: ClassVar[int]  # in each part
+    robots: ClassVar[int]  # number of robots in each part
     measures: ClassVar[Sequence[Measure]]
     overrides: ClassVar[Mapping[str, Any]] = {}  # config fields, in addition to rollout.OVERRIDES
 
@@ -114,14 +114,14 @@ class Skill(ABC):
 
     @abstractmethod
     def starts(self, robot: ExamRobot, count: int) -> Starts | None:
-        """Start states qpos (count, nq) and qvel (count, nv), equal at every call. None: as the task's episodes."""
+        """Start states qpos (count, nq) and qvel (count, nv), equal at every call. None: the task's start states."""
 
     @abstractmethod
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
-        """A value for each of ``measures``, or None if it cannot be measured. The result keeps further keys."""
+        """A value for each of ``measures``; None if it cannot be measured. The result stores other keys, too."""
 
     def result(self, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-        """The exam's result, for JSON, from the return value of ``judge`` for each part."""
+        """The exam's result, for JSON. ``parts``: name -> return value of ``judge``."""
         asked = {"kind": self.kind, **asdict(self)}
         found = {name: {key: _plain(value) for key, value in part.items()} for name, part in parts.items()}
         passed = all(figure.passes() is not False for part in found for figure in self.figures(found, part))
@@ -162,12 +162,12 @@ def _plain(value: Any) -> Any:
     return round(float(value), 5) if isinstance(value, (float, np.floating)) else value
 
 
-# ---- getup: stand up from unseen falls, on four grounds
+# ---- getup: stand up from falls that training did not use, on four grounds
 
 
 # Seed of the falls (training uses falls.seed), and time [s] from the drop to the start of the test.
 GETUP_SEED, GETUP_SETTLING = 20_000, 1.5
-# The robot stands: least share of the standing height, largest tilt [deg], largest mean joint speed [rad/s]. Ours.
+# Standing: smallest share of the standing height, largest tilt [deg], largest mean joint speed [rad/s]. Ours.
 GETUP_HIGH, GETUP_TILT, GETUP_SLOW = 0.9, 20.0, 0.5
 # The robot must stand for GETUP_HOLD [s] to count as up, and must still stand GETUP_STAY [s] later.
 GETUP_HOLD, GETUP_STAY = 0.5, 5.0
@@ -176,7 +176,7 @@ AT_LIMIT = 0.98  # share of the force limit: a larger torque counts as saturated
 
 @dataclass(frozen=True)
 class GetupExam(Skill):
-    """256 falls on each ground."""
+    """The exam of standing up, from 256 falls on each ground."""
 
     within: float = 3.0  # [s] time limit for standing up
 
@@ -210,12 +210,12 @@ class GetupExam(Skill):
         hold, stay, limit = (round(seconds / robot.dt) for seconds in (GETUP_HOLD, GETUP_STAY, self.within))
         held = _lasting(
             standing(robot, recording), hold
-        )  # (T - hold + 1, N): it stands for GETUP_HOLD from this step on
-        # (N,) first such step; the end if there is none
+        )  # (T - hold + 1, N) true if it stands for GETUP_HOLD from this step
+        # (N,) first such step; the last index + 1 if there is none
         up_at = np.where(held.any(axis=0), held.argmax(axis=0), len(held))
         up = up_at <= limit
         still = held[np.minimum(up_at + stay, len(held) - 1), np.arange(held.shape[1])] & up
-        until = np.arange(len(recording.qpos))[:, None] <= up_at  # (T, N): still getting up
+        until = np.arange(len(recording.qpos))[:, None] <= up_at  # (T, N) true until it stands
         seconds = np.where(up, up_at * robot.dt, np.inf)
         highest = np.where(robot.model.actuator_forcelimited, robot.model.actuator_forcerange[:, 1], np.inf)
         at_limit = (np.abs(recording.torque) >= AT_LIMIT * highest).mean(axis=2)
@@ -231,7 +231,7 @@ class GetupExam(Skill):
 
 
 def standing(robot: ExamRobot, recording: Recording) -> np.ndarray:
-    """(T, N): the base is high, upright, the joints are at rest, and the episode has not ended."""
+    """(T, N) true if the base is high and upright, the joints are at rest, and the episode has not ended."""
     axis = rotate(recording.qpos[..., 3:7], np.array([0.0, 0.0, 1.0]))  # the root's z axis in the world frame
     gravity = robot.model.opt.gravity / np.linalg.norm(robot.model.opt.gravity)
     upright = -(axis @ gravity) > np.cos(np.radians(GETUP_TILT))
@@ -241,28 +241,28 @@ def standing(robot: ExamRobot, recording: Recording) -> np.ndarray:
 
 
 def _lasting(true: np.ndarray, steps: int) -> np.ndarray:
-    """(T - steps + 1, N): ``true`` holds at this step and through the ``steps`` - 1 steps after it."""
+    """(T - steps + 1, N) true if ``true`` (T, N) holds at this step and in the next ``steps`` - 1 steps."""
     return np.asarray(np.lib.stride_tricks.sliding_window_view(true, steps, axis=0).all(axis=2))
 
 
-# ---- handstand: rise from four legs to a handstand or footstand and hold it for 5 s
+# ---- handstand: rise from a stand on four legs to a handstand or footstand and hold it for 5 s
 
 
 HANDSTAND_SEED, HANDSTAND_OFFSET = (
     30_000,
     0.05,
-)  # of the starts: each joint angle is offset by U(-HANDSTAND_OFFSET, HANDSTAND_OFFSET) [rad] [ours]
+)  # seed; each joint angle at the start has an offset U(-HANDSTAND_OFFSET, HANDSTAND_OFFSET) [rad] [ours]
 HANDSTAND_WITHIN, HANDSTAND_HOLD = 3.0, 5.0  # [s] time limit for rising, time to hold [ours]
-# The robot is up: [deg] largest angle from the root's x axis to the vertical, least share of the height [ours].
+# Handstand: largest angle between the root's x axis and the vertical [deg], smallest share of the height [ours].
 HANDSTAND_TILT, HANDSTAND_HIGH = 30.0, 0.8
 
 
 @dataclass(frozen=True)
 class HandstandExam(Skill):
-    """64 attempts on each ground."""
+    """The exam of a handstand or footstand, with 64 attempts on each ground."""
 
     nose: float = -1.0  # direction of the root's x axis: -1 down, 1 up
-    height: float = 0.55  # [m] of the root
+    height: float = 0.55  # [m] height of the root
     hands: tuple[str, ...] | list[str] = ()  # geoms that may touch the ground
 
     kind = "handstand"
@@ -304,12 +304,12 @@ class HandstandExam(Skill):
             "median": float(np.median(begin[holds]) * robot.dt) if holds.any() else None,
             "drift": float(drift[holds].mean()) if holds.any() else None,
             "power": float(recording.power()[up].mean()) if up.any() else None,
-            # a robot that failed, else the one that drifted most
+            # a robot that failed, else the robot with the largest drift
             "worst": int(np.argmax(np.where(holds, drift, np.inf))),
         }
 
     def _ground_contact(self, robot: ExamRobot, qpos: Floats) -> tuple[np.ndarray, np.ndarray]:
-        """(T, N): a geom other than the hands touches the ground. (T, N, 2): the midpoint of the hands [m]."""
+        """(T, N) true if a geom other than the hands touches the ground; (T, N, 2) [m] midpoint of the hands."""
         model, data = robot.model, mujoco.MjData(robot.model)
         free = np.array([model.geom(name).id for name in self.hands])
         steps, count = len(qpos), qpos.shape[1]
@@ -326,19 +326,19 @@ class HandstandExam(Skill):
         return touching, middle
 
 
-# ---- motion tracking: follow the whole first clip from its start, with and without pushes
+# ---- motion tracking: track the whole first clip from its start, with and without pushes
 
 
 # Offsets of a robot at the start: joint angles [rad], heading [rad], speed [m/s], each U(-off, off).
 JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1
-# [m], [-] Errors of the anchor's height and tilt at which a robot is lost. Source: BeyondMimic.
+# Largest errors of the anchor's height [m] and tilt [-]; beyond them tracking is lost. Source: BeyondMimic.
 LOST_HEIGHT, LOST_TILT = 0.25, 0.8
 FAR = 1e9  # switches off the task's termination rules, because exported policies do not have them
 
 
 @dataclass(frozen=True)
 class TrackingExam(Skill):
-    """Does the robot follow the clip to its end, and how closely?"""
+    """The exam of motion tracking: the share of robots that finish the clip, and their tracking errors."""
 
     kind = "tracking"
     asks = "The whole clip from its start, by 32 robots that begin a little off it; pushed ones get 0.5 m/s every 2 s."
@@ -387,7 +387,7 @@ class TrackingExam(Skill):
         joints = np.abs(recording.qpos[..., 7:] - motion.qpos[:, None, 7:]).mean(axis=2)
         up = [1.0 - 2.0 * (q[..., 1] ** 2 + q[..., 2] ** 2) for q in (turn[:, :, anchor], wanted_turn[:, :, anchor])]
         away = np.abs(found - wanted)[:, :, anchor, 2]
-        lost = ~((away <= LOST_HEIGHT) & (np.abs(up[0] - up[1]) <= LOST_TILT))  # NaN too
+        lost = ~((away <= LOST_HEIGHT) & (np.abs(up[0] - up[1]) <= LOST_TILT))  # also for NaN
         lost |= ~recording.alive()
         follows = ~np.maximum.accumulate(lost, axis=0)
         last, kept = follows[-1], follows.sum(axis=0)
@@ -395,7 +395,7 @@ class TrackingExam(Skill):
         drift = np.linalg.norm((found - wanted)[-1, last, anchor, :2], axis=1)
         return {
             "finished": float(last.mean()),
-            # the robot that was lost first, else the one with the largest error
+            # the first robot that lost the motion, else the robot with the largest error
             "worst": int(np.argmax(np.where(last, own, FAR - kept))),
             "body_error": float(1000.0 * error[follows].mean()) if follows.any() else None,
             "joint_error": float(joints[follows].mean()) if follows.any() else None,
@@ -414,7 +414,7 @@ def _posed(model: mujoco.MjModel, qpos: Floats, bodies: list[int]) -> tuple[Floa
     return tuple(values.reshape(*qpos.shape[:-1], *values.shape[1:]) for values in (places, turns))  # type: ignore[return-value]
 
 
-# ---- the exams by name
+# ---- exams by name
 
 
 SKILLS: dict[str, type[Skill]] = {kind.kind: kind for kind in (GetupExam, HandstandExam, TrackingExam)}
