@@ -200,6 +200,7 @@ def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
     assert row is not None
     assert row[0].count('class="value pass"') == 2 and row[0].count('class="value fail"') == 1
     assert "<small>+0.004</small>" in row[0] and ">0.568<" in row[0] and ">fell<" in html
+    assert html.count(">fell</text>") == len(plots.GAITS)  # the rival's line in each gait panel
     assert (
         "asked: vx -1.5 to 1.5 m/s, vy -0.8 to 0.8 m/s, yaw rate -1.2 to 1.2 rad/s. If the robot falls, the error of this command"
         in html

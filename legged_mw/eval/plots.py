@@ -342,13 +342,18 @@ def _gait(columns: Columns, world: int, ax: Axes) -> None:
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
     command = zip(AXES, rows[0]["command"], strict=True)
     ax.set_title(", ".join(f"{name} {value:g} {unit}" for (name, unit), value in command if value) or "stand")
-    rates = " / ".join("fell" if row["contact"] is None else f"{row['stride_frequency']:.1f}" for row in rows)
-    duties = " / ".join("-" if row["contact"] is None else f"{np.mean(row['duty_factor']):.2f}" for row in rows)
-    ax.set_title(f"{rates} Hz, duty {duties}", loc="right", color=MUTED, fontsize=7.0)
+    ax.set_title("\n".join(map(_stride, rows)), loc="right", color=MUTED, fontsize=7.0)
     ax.set_yticks(range(len(feet)), feet)
     ax.set(xlim=(0.0, None), ylim=(len(feet) - 0.5, -0.5), xlabel="time [s]")
     ax.grid(False, axis="y")
     ax.spines["left"].set_visible(False)
+
+
+def _stride(gait: Figures) -> str:
+    """Stride frequency and mean duty factor of one command."""
+    if gait["contact"] is None:
+        return "fell"
+    return f"{gait['stride_frequency']:.1f} Hz, duty {np.mean(gait['duty_factor']):.2f}"
 
 
 # ---- joints
