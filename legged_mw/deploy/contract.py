@@ -54,8 +54,8 @@ class Reader:
     def take(self, key: str, wanted: str, fits: Callable[[Any], bool]) -> Any:
         """The value of ``key``. Raises ContractError unless it ``fits``. ``wanted`` describes a valid value."""
         if key not in self.values or not fits(self.values[key]):
-            found = f"is {brief(self.values[key])}" if key in self.values else "is missing"
-            raise ContractError(f"{self.where}: '{key}' {found}; it must be {wanted}")
+            problem = f"is {brief(self.values[key])}" if key in self.values else "is missing"
+            raise ContractError(f"{self.where}: '{key}' {problem}; it must be {wanted}")
         return self.values[key]
 
     def section(self, key: str) -> Reader:
@@ -335,15 +335,15 @@ class Motors(NamedTuple):
     def gains(self, model: mujoco.MjModel, actuators: list[int], dofs: np.ndarray) -> dict[str, np.ndarray]:
         """Gains and torque-speed curve of ``model``: name in the contract -> (D,)."""
         prm = model.actuator_gainprm[actuators]
-        found = {}
+        gains = {}
         if self.law == "servo":
-            found = {"stiffness": prm[:, 0], "damping": model.dof_damping[dofs].reshape(len(dofs), -1)[:, 0]}
+            gains = {"stiffness": prm[:, 0], "damping": model.dof_damping[dofs].reshape(len(dofs), -1)[:, 0]}
         elif self.law == "dc_motor":
-            found = {"stiffness": prm[:, DC_STIFFNESS], "damping": prm[:, DC_DAMPING]}
+            gains = {"stiffness": prm[:, DC_STIFFNESS], "damping": prm[:, DC_DAMPING]}
         if self.stall_torque:
             constant, resistance = np.maximum(prm[:, DC_CONSTANT], 1e-12), np.maximum(prm[:, DC_RESISTANCE], 1e-12)
-            found |= {"motors: stall_torque": constant / resistance, "motors: no_load_speed": 1.0 / constant}
-        return found
+            gains |= {"motors: stall_torque": constant / resistance, "motors: no_load_speed": 1.0 / constant}
+        return gains
 
     def limp(self, batch: Any) -> None:
         """Switch off the motors of ``batch``, which are not servos. DC motors keep their damping."""
@@ -381,8 +381,8 @@ def ratings_to_dict(ratings: Ratings) -> dict[str, Any]:
     known = {name: values for name in TABLES if not np.isnan(values := getattr(ratings, name)).all()}
     lists = {name: [None if math.isnan(value) else value for value in known[name].tolist()] for name in known}
     battery = {} if math.isnan(ratings.battery_power) else {BATTERY: ratings.battery_power}
-    said = {name: short(values) for name, values in lists.items()} | battery
-    return {RATINGS: said} if said else {}
+    section = {name: short(values) for name, values in lists.items()} | battery
+    return {RATINGS: section} if section else {}
 
 
 def _rates(value: object) -> bool:
@@ -610,7 +610,7 @@ class Contract:
             if value
         }
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
-        said = {
+        content = {
             "format": FORMATS[-1],
             "task": self.task,
             "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
@@ -642,13 +642,13 @@ class Contract:
                 else {}
             ),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
-            **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
+            **{name: dict(item) for name, item in (("exam", self.exam), ("safety", self.safety)) if item is not None},
             **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
             **self.motors.to_dict(),
             **(ratings_to_dict(self.ratings) if self.ratings else {}),
             **({MOTION: self.motion.to_dict()} if self.motion else {}),
         }
-        return sealed(said)
+        return sealed(content)
 
 
 def _row_to_dict(row: ContractRow) -> dict[str, Any]:
@@ -667,7 +667,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
     Raises ContractError, or ConfigError for invalid YAML.
     """
     finish_moving(folder)
-    contract = _read(Reader(said := load_yaml(part(folder, CONTRACT_FILE)), CONTRACT_FILE), folder)
+    contract = _read(Reader(content := load_yaml(part(folder, CONTRACT_FILE)), CONTRACT_FILE), folder)
     _check_rows(contract)
     part(folder, NETWORK_FILE)
     if digest(folder / NETWORK_FILE) != contract.digest:
@@ -678,21 +678,21 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
     if edited:
         check_pose(contract.action, contract.joints, contract.default_pose)
         return contract
-    what_to_do = (
+    advice = (
         "undo the change, export the policy again, or say --edited, which shows each number beside the exported one"
     )
-    if CHECKSUM not in said:
+    if CHECKSUM not in content:
         raise ContractError(
-            f"{CONTRACT_FILE} has no line `{CHECKSUM}`, which says that it is as it was exported: {what_to_do}"
+            f"{CONTRACT_FILE} has no line `{CHECKSUM}`, which says that it is as it was exported: {advice}"
         )
-    if checksum(said) != said[CHECKSUM]:
+    if checksum(content) != content[CHECKSUM]:
         raise ContractError(
             f"{CONTRACT_FILE} was changed in what the network was trained with (its {CHECKSUM} differs); only {', '.join(FREE)} may be: "
-            f"{what_to_do}"
+            f"{advice}"
         )
     for name in _changed_files(folder, contract):
         raise ContractError(
-            f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {what_to_do}"
+            f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {advice}"
         )
     return contract
 
@@ -716,11 +716,11 @@ def edits(folder: Path) -> list[str]:
 
 
 def _changed_files(folder: Path, contract: Contract) -> list[str]:
-    stated = {SCENE_FILE: contract.scene, TERRAIN_FILE: contract.terrain}
+    checksums = {SCENE_FILE: contract.scene, TERRAIN_FILE: contract.terrain}
     return [
         name
-        for name, wanted in stated.items()
-        if wanted and (folder / name).is_file() and digest(folder / name) != wanted
+        for name, expected in checksums.items()
+        if expected and (folder / name).is_file() and digest(folder / name) != expected
     ]
 
 
@@ -865,10 +865,10 @@ def quantity_size(contract: Contract, name: str) -> int:
 
 def _check_rows(contract: Contract) -> None:
     """Check that every row can be measured and has the right size. Check that `falls_on` geoms have contact sensors."""
-    felt = [name.removeprefix("contact/") for name in contract.sensors.get(FALL, ())]
-    for name in contract.ends.falls_on if felt else ():
-        if name not in felt:
-            raise ContractError(f"{CONTRACT_FILE}: ends: falls_on: {unknown('geom', name, felt, f'sensors: {FALL}')}")
+    sensed = [name.removeprefix("contact/") for name in contract.sensors.get(FALL, ())]
+    for name in contract.ends.falls_on if sensed else ():
+        if name not in sensed:
+            raise ContractError(f"{CONTRACT_FILE}: ends: falls_on: {unknown('geom', name, sensed, f'sensors: {FALL}')}")
     measurable = {quantity.measured for quantity in ROWS.values()}
     for row in contract.rows:
         where = f"{CONTRACT_FILE}: observation row '{row.name}'"
@@ -887,8 +887,8 @@ def _check_rows(contract: Contract) -> None:
             raise ContractError(
                 f"{where}: {unknown('quantity', row.measured, [*sorted(measurable), SENSORS], 'what a robot measures')}"
             )
-        if row.size != (right := quantity_size(contract, row.measured)):
-            raise ContractError(f"{where} has size {row.size}; {row.measured} has {right} values on this robot")
+        if row.size != (expected := quantity_size(contract, row.measured)):
+            raise ContractError(f"{where} has size {row.size}; {row.measured} has {expected} values on this robot")
 
 
 # ---- checksum of a contract -----------------------------------------------------------------------------------------
@@ -904,41 +904,44 @@ FREE = ("task", "ends", "exam", "safety", RATINGS)
 _MOST_TEXT = 1 << 22  # [byte] limit of the unpacked `exported`; that of G1 has 0.25 % of it
 
 
-def checksum(said: Mapping[str, Any]) -> str:
+def checksum(content: Mapping[str, Any]) -> str:
     """SHA-256 of the contract's values that training used (joints, rows, scales ...), in their order."""
-    return hashlib.sha256(_bound(said).encode()).hexdigest()
+    return hashlib.sha256(_bound(content).encode()).hexdigest()
 
 
-def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     """The contract's content with the lines `exported` and `checksum` added."""
-    text = _bound({**said, EXPORTED: ""}).encode()
+    text = _bound({**content, EXPORTED: ""}).encode()
     return {
-        **said,
+        **content,
         EXPORTED: base64.b64encode(zlib.compress(text, 9)).decode(),
         CHECKSUM: hashlib.sha256(text).hexdigest(),
     }
 
 
-def changes(said: Mapping[str, Any]) -> list[str]:
+def changes(content: Mapping[str, Any]) -> list[str]:
     """One line for each value that differs from the exported value, with both values."""
-    if EXPORTED not in said and said.get(CHECKSUM) == checksum(said):  # formats before 5 have no copy
+    if EXPORTED not in content and content.get(CHECKSUM) == checksum(content):  # formats before 5 have no copy
         return []
     try:
-        packed = base64.b64decode(str(said[EXPORTED]), validate=True)
+        packed = base64.b64decode(str(content[EXPORTED]), validate=True)
         text = zlib.decompressobj().decompress(packed, _MOST_TEXT)
-        if hashlib.sha256(text).hexdigest() != said.get(CHECKSUM, hashlib.sha256(text).hexdigest()):
+        if hashlib.sha256(text).hexdigest() != content.get(CHECKSUM, hashlib.sha256(text).hexdigest()):
             raise ValueError("the copy was changed, too")
-        was, now = dict(_values(json.loads(text))), dict(_values(json.loads(_bound(said))))
+        exported, current = dict(_values(json.loads(text))), dict(_values(json.loads(_bound(content))))
     except (KeyError, ValueError, zlib.error, RecursionError):
         return [f"what was exported is unknown: its line `{EXPORTED}` is missing, or was changed too"]
-    both = [(place, *(brief(of[place]) if place in of else "nothing" for of in (now, was))) for place in {**was, **now}]
-    return [f"{place}: {new}, exported {old}" for place, new, old in both if new != old]
+    pairs = [
+        (place, *(brief(values[place]) if place in values else "nothing" for values in (current, exported)))
+        for place in {**exported, **current}
+    ]
+    return [f"{place}: {new}, exported {old}" for place, new, old in pairs if new != old]
 
 
-def _bound(said: Mapping[str, Any]) -> str:
+def _bound(content: Mapping[str, Any]) -> str:
     # formats before 5 have no copy, and their checksum does not cover `format`
-    free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in said else ["format"]))
-    return json.dumps({name: value for name, value in said.items() if name not in free}, default=str, skipkeys=True)
+    free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in content else ["format"]))
+    return json.dumps({name: value for name, value in content.items() if name not in free}, default=str, skipkeys=True)
 
 
 def _values(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:

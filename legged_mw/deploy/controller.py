@@ -111,12 +111,15 @@ class Follower:
     def rows(self, measured: Measurement, fresh: NDArray[np.bool_]) -> dict[str, Doubles]:
         """Observation rows of the motion, (N, ...) each. ``fresh`` (N,): robots at their first step."""
         place, turn = self._measured(measured)
-        shift, turned = self._moved(place, turn, fresh)
+        shift, rotation = self._moved(place, turn, fresh)
         frame = self._now()
-        there, wanted = _rotate(turned, self._place[frame]) + shift, multiply(turned, self._turn[frame])
-        off = _matrix(multiply(conjugate(turn), wanted))
+        target_place, target_turn = _rotate(rotation, self._place[frame]) + shift, multiply(rotation, self._turn[frame])
+        error = _matrix(multiply(conjugate(turn), target_turn))
         rows = {JOINT_POS: self._joints[0][frame], JOINT_VEL: self._joints[1][frame]}
-        return rows | {PLACE: _rotate(conjugate(turn), there - place), TURN: off[:, :, :2].reshape(len(off), 6)}
+        return rows | {
+            PLACE: _rotate(conjugate(turn), target_place - place),
+            TURN: error[:, :, :2].reshape(len(error), 6),
+        }
 
     def keep(self, measured: Measurement, fresh: NDArray[np.bool_]) -> None:
         """Advance by one step."""
@@ -159,10 +162,10 @@ class Follower:
         """Shift (N, 3) and rotation (N, 4) of the motion. They move it to ``fresh`` robots' position and heading."""
         if self.start is not None:
             return self._shift, self._heading
-        before = self._now() - 1
-        turned = np.where(fresh[:, None], heading(multiply(turn, conjugate(self._turn[before]))), self._heading)
-        shift = (place - _rotate(turned, self._place[before])) * [1.0, 1.0, 0.0]
-        return np.where(fresh[:, None], shift, self._shift), turned
+        previous = self._now() - 1
+        rotation = np.where(fresh[:, None], heading(multiply(turn, conjugate(self._turn[previous]))), self._heading)
+        shift = (place - _rotate(rotation, self._place[previous])) * [1.0, 1.0, 0.0]
+        return np.where(fresh[:, None], shift, self._shift), rotation
 
 
 def _rotate(q: Doubles, v: Doubles) -> Doubles:
@@ -201,11 +204,11 @@ class Network:
         self._session = self._first(
             lambda: onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"]), "read"
         )
-        memory, guessed = contract.memory, sum(row.size for row in contract.estimate)
+        memory, estimate_size = contract.memory, sum(row.size for row in contract.estimate)
         # name -> shape
         self._inputs = {contract.input: [contract.size]} | ({memory.input: [*memory.shape]} if memory else {})
         self._outputs = {contract.output: [len(contract.joints)]} | ({memory.output: [*memory.shape]} if memory else {})
-        self._outputs |= {ESTIMATE: [guessed]} if guessed else {}
+        self._outputs |= {ESTIMATE: [estimate_size]} if estimate_size else {}
         self._one_by_one = self._check(contract)
         self.estimate: NDArray[np.float32] | None = None
         self._try()
@@ -229,43 +232,43 @@ class Network:
     def _try(self) -> None:
         """Call the network once with zeros."""
         zeros = {name: np.zeros((1, *shape), dtype=np.float32) for name, shape in self._inputs.items()}
-        found = self._first(lambda: self._session.run([*self._outputs], zeros, self._run), "run")
-        for (name, shape), value in zip(self._outputs.items(), found, strict=True):
+        outputs = self._first(lambda: self._session.run([*self._outputs], zeros, self._run), "run")
+        for (name, shape), value in zip(self._outputs.items(), outputs, strict=True):
             if np.shape(value) != (1, *shape) or not np.isfinite(value).all():
-                got = np.shape(value) if np.shape(value) != (1, *shape) else "what is not finite"
+                problem = np.shape(value) if np.shape(value) != (1, *shape) else "what is not finite"
                 raise ContractError(
-                    f"{NETWORK_FILE}: its output '{name}' for an observation of zeros is {got}; export the policy again"
+                    f"{NETWORK_FILE}: its output '{name}' for an observation of zeros is {problem}; export the policy again"
                 )
 
     def _check(self, contract: Contract) -> bool:
         """Compare inputs and outputs with the contract. Returns True if the batch size is fixed to 1."""
         names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
-        guessed = "".join(f", {row.name} {row.size}" for row in contract.estimate)
-        for what, ports, shapes, why in (
+        estimate = "".join(f", {row.name} {row.size}" for row in contract.estimate)
+        for what, ports, shapes, meaning in (
             ("input", self._session.get_inputs(), self._inputs, f"the rows of `observation`: {names}"),
-            ("output", self._session.get_outputs(), self._outputs, f"one action a joint{guessed}"),
+            ("output", self._session.get_outputs(), self._outputs, f"one action a joint{estimate}"),
         ):
             if {port.name: port.shape[1:] for port in ports} != shapes:
-                found = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
-                stated = ", ".join(f"'{name}' {[1, *shape]}" for name, shape in shapes.items())
+                actual = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
+                expected = ", ".join(f"'{name}' {[1, *shape]}" for name, shape in shapes.items())
                 raise ContractError(
-                    f"{NETWORK_FILE} does not fit {CONTRACT_FILE}: its {what} is {found}, the contract's is {stated} ({why})"
+                    f"{NETWORK_FILE} does not fit {CONTRACT_FILE}: its {what} is {actual}, the contract's is {expected} ({meaning})"
                 )
         return self._session.get_inputs()[0].shape[0] == 1
 
     def __call__(self, *inputs: Floats) -> Any:
-        whole = {
+        arrays = {
             name: np.ascontiguousarray(value, dtype=np.float32)
             for name, value in zip(self._inputs, inputs, strict=True)
         }
         count = len(inputs[0])
         batches = (
-            [{name: value[i : i + 1] for name, value in whole.items()} for i in range(count)]
+            [{name: value[i : i + 1] for name, value in arrays.items()} for i in range(count)]
             if self._one_by_one
-            else [whole]
+            else [arrays]
         )
-        found = [self._session.run([*self._outputs], batch) for batch in batches]
-        outputs = dict(zip(self._outputs, (np.concatenate(parts) for parts in zip(*found, strict=True)), strict=True))
+        results = [self._session.run([*self._outputs], batch) for batch in batches]
+        outputs = dict(zip(self._outputs, (np.concatenate(parts) for parts in zip(*results, strict=True)), strict=True))
         self.estimate = outputs.pop(ESTIMATE, None)
         return list(outputs.values()) if len(outputs) > 1 else outputs.popitem()[1]
 
@@ -306,11 +309,11 @@ class Controller:
         if self.follower:
             self.follower.keep(measurement, self._fresh)
         self._fresh[:] = False
-        seen = self.last_observation = _side_by_side(self._frames)
+        observation = self.last_observation = _side_by_side(self._frames)
         if self.memory is None:
-            actions = self._network(seen)
+            actions = self._network(observation)
         else:
-            actions, self.memory = self._network(seen, self.memory)
+            actions, self.memory = self._network(observation, self.memory)
         actions = np.where(np.isfinite(actions), actions, np.nan)  # clipping would turn infinity into a valid action
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {
@@ -323,8 +326,8 @@ class Controller:
 
     def estimate(self, row: str) -> NDArray[np.float64] | None:
         """The policy's last estimate of ``row`` (N, size), in the contract's unit; None if there is none."""
-        columns, believed = columns_of(self.contract.estimate, row), getattr(self._network, "estimate", None)
-        return None if columns is None or believed is None else believed[:, columns].astype(np.float64)
+        columns, estimate = columns_of(self.contract.estimate, row), getattr(self._network, "estimate", None)
+        return None if columns is None or estimate is None else estimate[:, columns].astype(np.float64)
 
     def reset(self, which: Any = slice(None)) -> None:
         """Reset the robots ``which`` (indices or a mask): history, last actions, memory and reference frame."""
@@ -369,24 +372,24 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
     It runs untrusted files. After ``seconds`` it calls ``stop`` and raises TimeoutError; a thread that does not stop
     is abandoned. Memory is limited on Linux only.
     """
-    ended: Future[Any] = Future()
+    future: Future[Any] = Future()
 
     def run() -> None:
         try:
-            ended.set_result(work())
+            future.set_result(work())
         except BaseException as error:
-            ended.set_exception(error)
+            future.set_exception(error)
 
     thread = threading.Thread(target=run, daemon=True)
     with limited_memory(room):
         thread.start()
         thread.join(seconds)
-        if late := thread.is_alive():
+        if timed_out := thread.is_alive():
             stop()
             thread.join(1.0)
-    if late:
+    if timed_out:
         raise TimeoutError(f"it has not ended within {seconds:g} s")
-    return ended.result()
+    return future.result()
 
 
 @contextmanager
@@ -398,8 +401,8 @@ def limited_memory(size: int) -> Iterator[None]:
     import resource
 
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + size
-    resource.setrlimit(resource.RLIMIT_AS, (most if soft == resource.RLIM_INFINITY else min(most, soft), hard))
+    limit = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + size
+    resource.setrlimit(resource.RLIMIT_AS, (limit if soft == resource.RLIM_INFINITY else min(limit, soft), hard))
     try:
         yield
     finally:

@@ -47,18 +47,21 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="from the terminal as on a robot: states, safety limits, a log; in real time",
     )
-    checked = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
-    parser.add_argument("--check_joints", action="store_true", help=checked)
-    swept = (
+    check_help = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
+    parser.add_argument("--check_joints", action="store_true", help=check_help)
+    chirp_help = (
         "the joint check, then a sweep of each joint of a hanging robot, whose log legged-mw fit reads (docs/fit.md)"
     )
-    parser.add_argument("--chirp", action="store_true", help=swept)
-    first = "a robot's first walk: joint check, stand, stop, ten steps, a metre, each value beside the exam's robot"
-    parser.add_argument("--first_walk", action="store_true", help=first)
-    hangs = "a simulated robot hangs until the policy starts (default: if it has two feet), high: its feet in the air, as in --check_joints"
-    parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hangs)
-    limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
-    parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limits)
+    parser.add_argument("--chirp", action="store_true", help=chirp_help)
+    walk_help = "a robot's first walk: joint check, stand, stop, ten steps, a metre, each value beside the exam's robot"
+    parser.add_argument("--first_walk", action="store_true", help=walk_help)
+    hoist_help = (
+        "a simulated robot hangs until the policy starts (default: if it has two feet), "
+        "high: its feet in the air, as in --check_joints"
+    )
+    parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hoist_help)
+    limit_help = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
+    parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limit_help)
     parser.add_argument(
         "--gamepad", metavar="FILE", help="a gamepad that drives too (default: the first that is there), or off"
     )
@@ -87,28 +90,28 @@ def check_flags(args: argparse.Namespace) -> None:
     if args.first_walk and (others := others + [n for n in ("check_joints", "chirp") if getattr(args, n)]):
         raise FlagError(f"--first_walk is a list with commands and a joint check of its own: leave --{others[0]} out")
     args.drive |= _checks_joints(args)
-    several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
-    shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
-    watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
-    driven = "--drive" if args.drive else f"--robot {args.robot}" if args.robot != "simulated" else ""
-    if driven and (given := [name for name, value in several.items() if value] + watched):
-        raise FlagError(f"{driven} is one robot in real time: leave --{given[0]} out")
-    alone = {
+    other_modes = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
+    allowed = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
+    viewer_flags = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in allowed]
+    driving_flag = "--drive" if args.drive else f"--robot {args.robot}" if args.robot != "simulated" else ""
+    if driving_flag and (refused := [name for name, value in other_modes.items() if value] + viewer_flags):
+        raise FlagError(f"{driving_flag} is one robot in real time: leave --{refused[0]} out")
+    drive_flags = {
         "hoist": args.hoist and not args.serve,
         "limit": args.limit,
         "gamepad": args.gamepad,
         "stop_fd": args.stop_fd is not None,
         "log": args.log,
     }
-    if not driven and (given := [name for name, value in alone.items() if value]):
-        raise FlagError(f"--{given[0]} is of a robot that is driven: add --drive")
+    if not driving_flag and (refused := [name for name, value in drive_flags.items() if value]):
+        raise FlagError(f"--{refused[0]} is of a robot that is driven: add --drive")
     parse_limits(args.limit)
 
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     """True if a simulated robot starts on a hoist."""
-    checked = _checks_joints(args)
-    return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or checked))
+    checks_joints = _checks_joints(args)
+    return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or checks_joints))
 
 
 def lift(args: argparse.Namespace) -> float:
@@ -164,11 +167,11 @@ def drive(
             if mirror:
                 mirror.show(now, measured, states)
 
-        done = run(
+        summary = run(
             robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry
         )
-        logged = f"; {log.broken or f'logged to {shown(log.path)}'}" if log else ""
-        console.say(f"{done.timing}\nthe joints are damped{logged}{states.report}")
+        log_note = f"; {log.broken or f'logged to {shown(log.path)}'}" if log else ""
+        console.say(f"{summary.timing}\nthe joints are damped{log_note}{states.report}")
     if not states.right:
         raise SystemExit(1)
 
@@ -200,27 +203,27 @@ def _commands(
     contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, say: Callable[[str], None]
 ) -> Callable[[float], Floats]:
     """The command (C,) at a time [s] since the policy began: of the script, else ``fixed``, else the defaults."""
-    rest = np.array([each.default for each in contract.commands]) if fixed is None else np.array(fixed)
+    default = np.array([each.default for each in contract.commands]) if fixed is None else np.array(fixed)
     if not args.commands:
-        return lambda _: rest
+        return lambda _: default
     script = load_script(args.commands, contract.commands).entries
     if others := sum((entry.push is not None) + entry.reset for entry in script):
         say(
             f"--commands {args.commands}: {others} of its pushes and resets are left out; a robot that is driven has commands alone"
         )
     entries = [(entry.time, np.array(entry.command)) for entry in script if entry.command]
-    return lambda time: next((command for start, command in reversed(entries) if start <= time + 1e-9), rest)
+    return lambda time: next((command for start, command in reversed(entries) if start <= time + 1e-9), default)
 
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
     """Context manager: SIGTERM and a closed terminal damp the robot like Ctrl-C."""
-    asked = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(each, signal.default_int_handler) for each in asked]
+    signals = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(each, signal.default_int_handler) for each in signals]
     try:
         yield
     finally:
-        for each, handler in zip(asked, before, strict=True):
+        for each, handler in zip(signals, before, strict=True):
             signal.signal(each, handler)
 
 

@@ -56,15 +56,15 @@ def from_sticks(remote: Remote, table: Sequence[Command]) -> Floats | None:
 
     The ends of a stick are the ends of the trained range. Its centre is the default.
     """
-    wanted, moved = np.array([each.default for each in table]), False
+    command, moved = np.array([each.default for each in table]), False
     for column, each in enumerate(table):
         stick, sign = _STICKS.get(each.name, ("", 0.0))
         value = sign * getattr(remote, stick) if stick else 0.0
         if abs(value) > DEAD:
             end = each.high if value > 0 else each.low
-            wanted[column] = each.default + min(abs(value), 1.0) * (end - each.default)
+            command[column] = each.default + min(abs(value), 1.0) * (end - each.default)
             moved = True
-    return wanted if moved else None
+    return command if moved else None
 
 
 class RobotRemote:
@@ -114,8 +114,8 @@ class Gamepad(RobotRemote):
             pressed |= self._wish(self._remote()).pressed  # a press can begin and end between two steps
         if self._lost:
             return DriveInput(stop=f"{self.name} was unplugged")
-        wish = self._wish(self._remote())
-        return wish._replace(pressed=wish.pressed | pressed)
+        inputs = self._wish(self._remote())
+        return inputs._replace(pressed=inputs.pressed | pressed)
 
     def close(self) -> None:
         if self._file >= 0:

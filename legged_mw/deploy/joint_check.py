@@ -103,15 +103,15 @@ class JointCheck(States):
     # ---- motions: generators that receive measurements and yield orders
 
     def _check(self, measured: Measurement) -> Moves:
-        limits, held = self._limits, np.ones(len(self.joints))
+        limits, ones = self._limits, np.ones(len(self.joints))
         pose = np.clip(measured.joint_pos, limits.lowest, limits.highest)
         settle = round(SETTLE / self.controller.contract.period)
         for step in range(settle):
-            measured = yield self._order(pose, held * (step + 1) / settle)
-            if np.abs(away := measured.joint_pos - pose).max() > FAR:
-                joint = int(np.abs(away).argmax())
+            measured = yield self._order(pose, ones * (step + 1) / settle)
+            if np.abs(error := measured.joint_pos - pose).max() > FAR:
+                joint = int(np.abs(error).argmax())
                 self._tell(
-                    f"{self.joints[joint]} was held where it was and went {away[joint]:+.2f} rad: WRONG JOINT or WRONG SIGN"
+                    f"{self.joints[joint]} was held where it was and went {error[joint]:+.2f} rad: WRONG JOINT or WRONG SIGN"
                 )
                 return
         for joint in range(len(self.joints)):
@@ -121,7 +121,7 @@ class JointCheck(States):
 
     def _one(self, joint: int, pose: Floats) -> Moves:
         """Move a joint by STEP, hold it, and move it back. It moves by -STEP near its upper limit."""
-        contract, limits, gains, to = self.controller.contract, self._limits, np.ones(len(pose)), pose.copy()
+        contract, limits, gains, targets = self.controller.contract, self._limits, np.ones(len(pose)), pose.copy()
         top = min(limits.high[joint], limits.highest[joint])
         step = STEP if pose[joint] + STEP <= top else -STEP
         self._tell(f"{self.joints[joint]}{self._motor(joint, ' (motor {})')} goes {step:+.2f} rad")
@@ -130,21 +130,21 @@ class JointCheck(States):
         before = measured = yield self._order(pose, gains)
         moved = np.zeros(len(pose))
         for tick in range(ramp + hold):
-            to[joint] = pose[joint] + step * min(1.0, (tick + 1) / ramp)
-            measured = yield self._order(to, gains)
+            targets[joint] = pose[joint] + step * min(1.0, (tick + 1) / ramp)
+            measured = yield self._order(targets, gains)
             moved = measured.joint_pos - before.joint_pos
             if np.abs(moved).max() > FAR:
                 break
             if tick >= ramp + soft and np.abs(moved).max() < CLOSE:
                 gains[joint] = min(1.0, gains[joint] + STIFFEN * contract.period)
-        there, back, took = measured, measured, float(gains[joint])
+        there, back, gain = measured, measured, float(gains[joint])
         for tick in range(0 if np.abs(moved).max() > FAR else ramp + rest):
-            to[joint] = pose[joint] + step * max(0.0, 1.0 - (tick + 1) / ramp)
+            targets[joint] = pose[joint] + step * max(0.0, 1.0 - (tick + 1) / ramp)
             gains[joint] += (1.0 - gains[joint]) / max(1, ramp - tick)
-            back = yield self._order(to, gains)
+            back = yield self._order(targets, gains)
         self.rows.append(
             JointResult(
-                joint, step, moved, took, self._verdict(joint, step, moved, self._tilts(joint, before, there, back))
+                joint, step, moved, gain, self._verdict(joint, step, moved, self._tilts(joint, before, there, back))
             )
         )
 
@@ -186,10 +186,10 @@ class JointCheck(States):
         shift = centres[1] - centres[0]
         shift -= (shift @ before.gravity) * before.gravity
         mass, body = model.body_subtreemass, model.joint(self.joints[joint]).bodyid[0]
-        tilts = [there.gravity - then.gravity for then in (before, back)]
+        tilts = [there.gravity - reference.gravity for reference in (before, back)]
         sizes = [float(np.linalg.norm(tilt)) for tilt in tilts]
-        tells = mass[body] < HEAVY * mass[1] and min(sizes) > LEAN
-        return not tells or any(
+        useful = mass[body] < HEAVY * mass[1] and min(sizes) > LEAN
+        return not useful or any(
             t @ shift > ALONG * n * np.linalg.norm(shift) for t, n in zip(tilts, sizes, strict=True)
         )
 
@@ -202,24 +202,24 @@ class JointCheck(States):
         width = max(map(len, self.joints))
         form = f"{{:<{width}}} {{:>5}} {{:>6}} {{:>6}} {{:>9}}  {{:<{width + 7}}} {{}}"
         lines = [form.format("joint", "motor", "asked", "moved", "stiffness", "most of the others", "verdict")]
-        for joint, asked, moved, stiffness, verdict in self.rows:
+        for joint, commanded, moved, stiffness, verdict in self.rows:
             other = self._other(joint, moved)
-            most = f"{self.joints[other]} {moved[other]:+.3f}" if abs(moved[other]) >= 0.001 else "-"
+            largest_other = f"{self.joints[other]} {moved[other]:+.3f}" if abs(moved[other]) >= 0.001 else "-"
             own = f"{moved[joint]:+.3f}"
             lines.append(
                 form.format(
                     self.joints[joint],
                     self._motor(joint) or "-",
-                    f"{asked:+.2f}",
+                    f"{commanded:+.2f}",
                     own,
                     f"{stiffness:.0%}",
-                    most,
+                    largest_other,
                     verdict,
                 )
             )
-        wrong = [self.joints[row.joint] for row in self.rows if row.verdict != "right"]
-        said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (
-            f"; wrong: {', '.join(wrong)}" if wrong else ""
+        faulty = [self.joints[row.joint] for row in self.rows if row.verdict != "right"]
+        summary = f"{len(self.rows)} of {len(self.joints)} joints checked" + (
+            f"; wrong: {', '.join(faulty)}" if faulty else ""
         )
         early = "" if len(self.rows) == len(self.joints) else f"; ended early: {self.note}"
-        return "\n".join(["", *lines, said + (early or ("" if wrong else "; none is wrong"))])
+        return "\n".join(["", *lines, summary + (early or ("" if faulty else "; none is wrong"))])

@@ -85,7 +85,7 @@ class Log:
             self._file = path.open("xb")
         except OSError as error:
             raise LogError(f"cannot write the log {path}: {error.strerror}; say --log FILE, or --log off") from None
-        said = {
+        about = {
             "format": FORMAT,
             "task": contract.task,
             "network": contract.digest,
@@ -93,7 +93,7 @@ class Log:
             "export": str(folder.resolve()),
         }
         self._blocks: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-        header = json.dumps({**said, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})
+        header = json.dumps({**about, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})
         files = {name: np.fromfile(folder / name, np.uint8) for name in EXPORT if (folder / name).is_file()}
         self._blocks.put({"header": header, **files})
         self._events: list[tuple[float, str]] = []
@@ -106,8 +106,8 @@ class Log:
         self, loop: Loop, controller: Controller, measured: Measurement, health: Health, order: Order, command: Floats
     ) -> None:
         """Log one step. Missing values are NaN."""
-        nothing, contract = np.nan, self.contract
-        targets, acts = order.targets is not None, order.state == POLICY
+        missing, contract = np.nan, self.contract
+        targets, active = order.targets is not None, order.state == POLICY
         stiffness = contract.stiffness if order.stiffness is None else order.stiffness
         damping = contract.damping if order.damping is None else order.damping
         values = {
@@ -117,14 +117,14 @@ class Log:
                 "voltage": _or_nan(health.voltage),
                 "temperature": _or_nan(health.temperatures),
             },
-            **{"command": command, "observation": controller.last_observation[0] if acts else nothing},
+            **{"command": command, "observation": controller.last_observation[0] if active else missing},
             **{
-                "action": controller.last_actions[0] if acts else nothing,
-                "wanted": controller.last_targets[0] if acts else nothing,
+                "action": controller.last_actions[0] if active else missing,
+                "wanted": controller.last_targets[0] if active else missing,
             },
-            "target": order.targets if targets else nothing,  # as sent to the servos
-            **{"stiffness": stiffness if targets else nothing, "damping": damping if targets else nothing},
-            ESTIMATE: _believed(controller) if acts else nothing,
+            "target": order.targets if targets else missing,  # as sent to the servos
+            **{"stiffness": stiffness if targets else missing, "damping": damping if targets else missing},
+            ESTIMATE: _believed(controller) if active else missing,
         }
         for name, column in self._rows.items():
             value = values.get(name)
@@ -219,12 +219,12 @@ def read_log(path: Path) -> DriveLog:
             else {}
         )
         events = [(float(now), str(text)) for block in blocks for now, text in json.loads(str(block["events"]))]
-        fits = header["format"] == FORMAT
+        readable = header["format"] == FORMAT
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         raise LogError(f"{path} is no log of legged_mw.deploy") from None
-    if not fits:
+    if not readable:
         raise LogError(f"{path} is a log of format {header['format']}; this version reads {FORMAT}")
     if not rows:
         raise LogError(f"{path} holds no step: its run ended within the first {CHUNK}, or was cut off")

@@ -49,13 +49,13 @@ class RobotMonitor:
         """Open the viewer in ``args`` (see ``launch.add_flags``). Raises ViewError."""
         settings = {"folder": str(folder.resolve()), **{name: getattr(args, name) for name in FLAGS}}
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-        channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        channel, viewer_channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self.begin(contract, channel)
-        with theirs:
-            settings["channel"] = theirs.fileno()
+        with viewer_channel:
+            settings["channel"] = viewer_channel.fileno()
             command = [sys.executable, "-c", program, json.dumps(settings)]
             # Ctrl-C must not end the viewer
-            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)
+            self._process = subprocess.Popen(command, pass_fds=(viewer_channel.fileno(),), start_new_session=True)
         problem = self._problem()
         self._channel.setblocking(False)
         if problem:
@@ -64,10 +64,10 @@ class RobotMonitor:
 
     def _problem(self) -> str:
         """Wait for the viewer. Returns the reason if it did not open, else an empty string."""
-        end, alive = time.monotonic() + START, True
+        deadline, alive = time.monotonic() + START, True
         self._channel.settimeout(0.1)
         while alive:
-            alive = self._process.poll() is None and time.monotonic() < end
+            alive = self._process.poll() is None and time.monotonic() < deadline
             with suppress(OSError):
                 return self._channel.recv(4096).decode()
         return f"the viewer did not start: it ended, or took longer than {START:g} s; leave --viewer out"

@@ -73,24 +73,24 @@ class Odometry:
 
     def __call__(self, measured: Measurement) -> Measurement:
         """Replace the velocity of ``measured`` by the estimate. N robots; one robot needs no leading axis."""
-        gyro, gravity, felt = (
+        gyro, gravity, specific_force = (
             np.atleast_2d(each) for each in (measured.ang_vel, measured.gravity, measured.acceleration)
         )
-        felt_before = np.where(np.isfinite(self._shock), self._shock, felt)
-        self._shock = felt.copy()
-        pull = 0.5 * (felt + felt_before) + self.gravity * gravity
-        velocity = self.velocity + self.contract.period * (pull - np.cross(gyro, self.velocity))
+        last_force = np.where(np.isfinite(self._shock), self._shock, specific_force)
+        self._shock = specific_force.copy()
+        acceleration = 0.5 * (specific_force + last_force) + self.gravity * gravity
+        velocity = self.velocity + self.contract.period * (acceleration - np.cross(gyro, self.velocity))
         variance = self._variance + (self.contract.period * DRIFT) ** 2
         legs = self.legs(measured)
-        missed = ((legs.velocity - velocity[:, None]) ** 2).sum(axis=2)
-        noise = STANDING**2 * (1.0 + missed / (self._doubt**2 + variance[:, None]))
-        trust = np.where(self.stands(measured, legs), 1.0 / noise, 0.0)  # (N, F)
-        self._variance = 1.0 / (1.0 / variance + trust.sum(axis=1))
-        pulled = velocity / variance[:, None] + (trust[..., None] * legs.velocity).sum(axis=1)
-        found = pulled * self._variance[:, None]
-        self.velocity = found.copy()
-        self.reset(~np.isfinite(found).all(axis=1))  # an estimate that is not finite is returned once, then reset
-        return replace(measured, lin_vel=found.reshape(np.shape(measured.lin_vel)))
+        error = ((legs.velocity - velocity[:, None]) ** 2).sum(axis=2)
+        noise = STANDING**2 * (1.0 + error / (self._doubt**2 + variance[:, None]))
+        weight = np.where(self.stands(measured, legs), 1.0 / noise, 0.0)  # (N, F)
+        self._variance = 1.0 / (1.0 / variance + weight.sum(axis=1))
+        weighted_sum = velocity / variance[:, None] + (weight[..., None] * legs.velocity).sum(axis=1)
+        estimate = weighted_sum * self._variance[:, None]
+        self.velocity = estimate.copy()
+        self.reset(~np.isfinite(estimate).all(axis=1))  # an estimate that is not finite is returned once, then reset
+        return replace(measured, lin_vel=estimate.reshape(np.shape(measured.lin_vel)))
 
     def stands(self, measured: Measurement, legs: Legs) -> NDArray[np.bool_]:
         """(N, F) true for a stance foot, by the source of contact."""
@@ -116,24 +116,26 @@ class Odometry:
         place = legs.place[0, legs.force[0] > LOADED * weight]
         if len(place) < 3 or legs.force.sum() < CARRIES * weight:
             return np.full(3, np.nan)
-        across = np.linalg.svd(place - place.mean(axis=0))[2][2]
-        return across * np.sign(across @ place.mean(axis=0))
+        normal = np.linalg.svd(place - place.mean(axis=0))[2][2]
+        return normal * np.sign(normal @ place.mean(axis=0))
 
     def leaning(self, angles: Floats, axis: Floats) -> Floats:
         """(D,) [rad/rad] rotation of each joint per rotation of the body about ``axis`` (3,), with fixed feet."""
-        place, slopes = self._feet_of(angles, np.array([0.0, 0.0, -1.0]))
-        found = np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
-        return np.array(found, dtype=float)
+        place, jacobians = self._feet_of(angles, np.array([0.0, 0.0, -1.0]))
+        rotation = np.linalg.lstsq(
+            jacobians.reshape(-1, jacobians.shape[2]), np.cross(place, axis).ravel(), rcond=0.01
+        )[0]
+        return np.array(rotation, dtype=float)
 
     def _legs(
         self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats
     ) -> tuple[Floats, Floats, Floats]:
         """``Legs`` of one robot, without the leading axis."""
-        place, slopes = self._feet_of(angles, gravity)
-        wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[
-            ..., 0
-        ]
-        return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
+        place, jacobians = self._feet_of(angles, gravity)
+        wrench = np.linalg.solve(
+            jacobians @ jacobians.transpose(0, 2, 1) + 1e-4 * np.eye(3), (jacobians @ torques)[..., None]
+        )[..., 0]
+        return place, -(np.cross(gyro, place) + jacobians @ speeds), wrench @ gravity
 
     def _feet_of(self, angles: Floats, gravity: Floats) -> tuple[Floats, Floats]:
         """Foot positions (F, 3) [m] and their Jacobians (F, 3, D), in the IMU's frame. The root is fixed."""
@@ -142,12 +144,12 @@ class Odometry:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         origin, turn = data.site_xpos[self._imu], data.site_xmat[self._imu].reshape(3, 3)
-        down, own, moved = turn @ gravity, np.zeros((3, model.nv)), np.zeros((len(self._feet), 3, model.nv))
+        down, own, jacobians = turn @ gravity, np.zeros((3, model.nv)), np.zeros((len(self._feet), 3, model.nv))
         mujoco.mj_jac(model, data, own, None, origin, model.site_bodyid[self._imu])
         place = np.array([foot.lowest(data, down) for foot in self._feet])
-        for jacobian, foot, point in zip(moved, self._feet, place, strict=True):
+        for jacobian, foot, point in zip(jacobians, self._feet, place, strict=True):
             mujoco.mj_jac(model, data, jacobian, None, point, foot.body)
-        return (place - origin) @ turn, turn.T @ (moved - own)[:, :, self._dofs]
+        return (place - origin) @ turn, turn.T @ (jacobians - own)[:, :, self._dofs]
 
 
 class _Foot:

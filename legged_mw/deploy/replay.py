@@ -63,10 +63,10 @@ def _replay(path: Path, recording: DriveLog, folder: Path, edited: bool) -> Repl
         raise LogError(
             f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export"
         )
-    walked = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
-    if walked.stop - walked.start < SHORTEST:
+    walk = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
+    if walk.stop - walk.start < SHORTEST:
         raise LogError(f"{shown(path)} holds no walk of {SHORTEST} steps: the policy was not on for so long")
-    rows = {name: values[walked].astype(float) for name, values in recording.rows.items()}
+    rows = {name: values[walk].astype(float) for name, values in recording.rows.items()}
     return Replay(contract, recording, rows, _simulate(folder, contract, rows))
 
 
@@ -85,17 +85,17 @@ def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
         Safety(contract, Limits.of(folder, contract)),
     )
     _pose(robot, {name: rows[name][0] for name in ("joint_pos", "joint_vel", "gravity", "lin_vel", "ang_vel")})
-    found: dict[str, list[Floats]] = {name: [] for name in (*QUANTITIES, "target")}
+    simulated: dict[str, list[Floats]] = {name: [] for name in (*QUANTITIES, "target")}
     for command in rows["command"]:
         measured = robot.read()
         if robot.fell():
             break
         targets = safety.held(controller.act(measured, contract.held(command))[0])
         for name in QUANTITIES:
-            found[name].append(getattr(measured, name))
-        found["target"].append(targets)
+            simulated[name].append(getattr(measured, name))
+        simulated["target"].append(targets)
         robot.write(targets)
-    return {name: np.array(values) for name, values in found.items()}
+    return {name: np.array(values) for name, values in simulated.items()}
 
 
 def _pose(robot: MujocoRobot, start: Rows) -> None:
@@ -139,11 +139,14 @@ def _lag(target: Floats, angle: Floats, speed: Floats, torque: Floats, stiffness
     angle, speed, torque = angle[LAGS:], speed[LAGS:], torque[LAGS:]
     best, least = math.nan, (1.0 - EXPLAINED) * float(torque.var())
     for lag, (newer, older) in enumerate(pairwise(lagged)):
-        wanted, causes = torque - stiffness * (newer - angle), np.stack([stiffness * (older - newer), -speed], axis=1)
-        share = float(np.clip(np.linalg.lstsq(causes, wanted, rcond=None)[0][0], 0.0, 1.0))
-        wanted = wanted - share * causes[:, 0]
-        rest = wanted - speed * (wanted @ speed) / max(float(speed @ speed), 1e-12)
-        if (error := float((rest**2).mean())) < least:
+        residual, regressors = (
+            torque - stiffness * (newer - angle),
+            np.stack([stiffness * (older - newer), -speed], axis=1),
+        )
+        share = float(np.clip(np.linalg.lstsq(regressors, residual, rcond=None)[0][0], 0.0, 1.0))
+        residual = residual - share * regressors[:, 0]
+        remainder = residual - speed * (residual @ speed) / max(float(speed @ speed), 1e-12)
+        if (error := float((remainder**2).mean())) < least:
             best, least = lag + share, error
     return best
 
@@ -172,10 +175,10 @@ def figures(rows: Rows, contract: Contract) -> dict[str, Floats]:
 
 
 def _title(replayed: Replay) -> str:
-    said, period = replayed.recording.header, replayed.contract.period
-    steps, made = len(replayed.robot["command"]), len(replayed.simulated["target"])
-    fell = "" if made == steps else f"; the simulated robot fell after {made * period:.1f} s"
-    return f"{said['task']}, {said['robot']}, {said['began']}: {steps * period:.1f} s of the policy{fell}"
+    header, period = replayed.recording.header, replayed.contract.period
+    steps, simulated_steps = len(replayed.robot["command"]), len(replayed.simulated["target"])
+    fell = "" if simulated_steps == steps else f"; the simulated robot fell after {simulated_steps * period:.1f} s"
+    return f"{header['task']}, {header['robot']}, {header['began']}: {steps * period:.1f} s of the policy{fell}"
 
 
 def table(replayed: Replay) -> str:
@@ -184,7 +187,7 @@ def table(replayed: Replay) -> str:
     robot, simulated = figures(rows, contract), figures(replayed.simulated, contract)
 
     def pair(key: str, i: int, digits: int) -> str:
-        texts = [f"{found[key][i]:.{digits}f}" if math.isfinite(found[key][i]) else "-" for found in (robot, simulated)]
+        texts = [f"{each[key][i]:.{digits}f}" if math.isfinite(each[key][i]) else "-" for each in (robot, simulated)]
         return f"{texts[0]:>10}{texts[1]:>8}"
 
     lines = [
@@ -223,18 +226,18 @@ def draw(replayed: Replay, path: Path) -> None:
         "\n".join([_title(replayed), *(f"{now:.2f} s  {text}" for now, text in replayed.recording.events[:4])]),
         fontsize=9,
     )
-    time, made = rows["time"][:, 0], len(simulated["target"])
+    time, simulated_steps = rows["time"][:, 0], len(simulated["target"])
     _velocities([figure.add_subplot(grid[0, i]) for i in range(3)], contract, rows, simulated, time)
-    both, where = (figures(rows, contract), figures(simulated, contract)), np.arange(len(contract.joints))
+    both_figures, places = (figures(rows, contract), figures(simulated, contract)), np.arange(len(contract.joints))
     for i, (key, title) in enumerate(
         (("torque", "torque, rms [N m]"), ("error", "target - angle, rms [rad]"), ("latency", "latency [ms]"))
     ):
         axes = figure.add_subplot(grid[1, i], title=title)
-        for shift, values, label in zip((-0.2, 0.2), both, ("robot", "simulated"), strict=True):
-            axes.bar(where + shift, np.nan_to_num(values[key]), 0.4, label=label)
-        axes.set_xticks(where, contract.joints, rotation=90, fontsize=5)
+        for shift, values, label in zip((-0.2, 0.2), both_figures, ("robot", "simulated"), strict=True):
+            axes.bar(places + shift, np.nan_to_num(values[key]), 0.4, label=label)
+        axes.set_xticks(places, contract.joints, rotation=90, fontsize=5)
         axes.legend(fontsize=6)
-    joint = int(np.argmax(np.abs(both[0]["torque"] - both[1]["torque"])))
+    joint = int(np.argmax(np.abs(both_figures[0]["torque"] - both_figures[1]["torque"])))
     for i, (key, unit) in enumerate((("joint_pos", "rad"), ("joint_torque", "N m"))):
         axes = figure.add_subplot(
             grid[2 + i, :2], title=f"{contract.joints[joint]} [{unit}]: the joint whose torque differs most"
@@ -242,7 +245,7 @@ def draw(replayed: Replay, path: Path) -> None:
         if key == "joint_pos":
             axes.plot(time, rows["target"][:, joint], color="0.6", linewidth=0.8, label="target")
         axes.plot(time, rows[key][:, joint], label="robot")
-        axes.plot(time[:made], simulated[key][:, joint], label="simulated")
+        axes.plot(time[:simulated_steps], simulated[key][:, joint], label="simulated")
         axes.legend(fontsize=6)
     axes = figure.add_subplot(grid[2:, 2], title="timing [ms]", xlabel="[s]")
     for name in ("behind", "work", "age"):
@@ -256,12 +259,12 @@ def draw(replayed: Replay, path: Path) -> None:
 
 def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows, time: Floats) -> None:
     """Plot vx, vy and yaw rate: command, robot, simulation."""
-    names, made = [each.name for each in contract.commands], len(simulated["target"])
+    names, simulated_steps = [each.name for each in contract.commands], len(simulated["target"])
     for i, (axes, title) in enumerate(zip(many, AXES, strict=True)):
         axes.set_title(title)
         if VELOCITY[i] in names:
             axes.plot(time, rows["command"][:, names.index(VELOCITY[i])], color="0.6", label="command")
         for each, label in ((rows, "robot"), (simulated, "simulated")):
             values = each["ang_vel"][:, 2] if i == 2 else _lin_vel(each, contract)[:, i]
-            axes.plot(time[:made] if each is simulated else time, values, linewidth=0.8, label=label)
+            axes.plot(time[:simulated_steps] if each is simulated else time, values, linewidth=0.8, label=label)
         axes.legend(fontsize=6)

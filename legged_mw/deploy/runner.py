@@ -61,7 +61,7 @@ def run(
     ``odometry`` replaces the measured velocity by its estimate.
     """
     safety = safety or Safety(controller.contract, Limits.of(controller.folder, controller.contract, robot.limits))
-    one, velocities = (
+    step, velocities = (
         _Step(robot, controller, command, safety, states, log, odometry),
         _Velocities(controller.contract.period, seconds),
     )
@@ -74,8 +74,8 @@ def run(
             stack.enter_context(robot)
             controller.reset()
             for now in loop.ticks(seconds):
-                measured = one.take(loop)
-                if one.over:
+                measured = step.take(loop)
+                if step.over:
                     break
                 if measured:
                     velocities.add(measured)
@@ -84,7 +84,10 @@ def run(
         if log and live:
             log.event(loop.now, str(loop.timing()))
     return replace(
-        one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None
+        step.summary,
+        velocity=velocities.mean(step.summary.steps),
+        late=loop.late,
+        timing=loop.timing() if live else None,
     )
 
 
@@ -127,8 +130,8 @@ class _Step:
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
         if states and controller.contract.action.origin == TORQUE:
-            why = "a policy of torques cannot stand a robot up: its states need servos"
-            raise RobotError(f"{why}; run it without states, or watch it in simulation without --drive")
+            reason = "a policy of torques cannot stand a robot up: its states need servos"
+            raise RobotError(f"{reason}; run it without states, or watch it in simulation without --drive")
 
     @property
     def over(self) -> bool:
@@ -150,8 +153,8 @@ class _Step:
                 order = order._replace(stiffness=None, damping=None)
             if order.targets is not None:
                 trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
-                held = self.safety.held(order.targets)
-                order = self._trip(trip, loop.now) if trip else order._replace(targets=held)
+                clipped = self.safety.held(order.targets)
+                order = self._trip(trip, loop.now) if trip else order._replace(targets=clipped)
         self._do(order)
         if self.log and measured:
             self.log.add(

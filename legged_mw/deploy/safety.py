@@ -89,10 +89,10 @@ class Limits:
         There are four sources. A later one overrides: the scene, the contract's section ``safety``, ``robot``
         (limits of the robot's class), ``asked`` (limits of the command line).
         """
-        falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
+        max_tilt = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
         limits = replace(
             limits_of(compile_scene(part(folder, SCENE_FILE)), contract),
-            tilt=falls if falls > 90.0 else min(Limits.tilt, falls),
+            tilt=max_tilt if max_tilt > 90.0 else min(Limits.tilt, max_tilt),
         )
         for values, where in (
             (contract.safety, f"{CONTRACT_FILE}: safety"),
@@ -200,25 +200,25 @@ class Safety:
         ``stiffness`` and ``damping`` (D,) of the servos; None: the contract's.
         """
         limits, contract = self.limits, self.contract
-        strong = "is asked for {value:.1f} N m, more than {most:.1f}"
+        text = "is asked for {value:.1f} N m, more than {most:.1f}"
         if not (finite := np.isfinite(targets)).all():
             joint = _first(~finite)
             return Trip("finite", f"the target of {contract.joints[joint]} is not finite: {targets[joint]}")
         if contract.action.origin == TORQUE and stiffness is None:
-            return self._most("torque", strong, np.abs(targets), limits.torque * limits.motor)
+            return self._most("torque", text, np.abs(targets), limits.torque * limits.motor)
         stiffness = contract.stiffness if stiffness is None else stiffness
         damping = contract.damping if damping is None else damping
         torque = np.abs(stiffness * (self.held(targets) - measured.joint_pos) - damping * measured.joint_vel)
-        stepped = np.zeros_like(targets) if self._last is None else np.abs(targets - self._last)
+        step = np.zeros_like(targets) if self._last is None else np.abs(targets - self._last)
         trip = (
             self._range("target", "is told to go to", targets, limits.target)
             or self._most(
                 "step",
                 "is told to step by {value:.2f} rad from one target to the next, more than {most:.2f}",
-                stepped,
+                step,
                 limits.step,
             )
-            or self._most("torque", strong, torque, limits.torque * limits.motor)
+            or self._most("torque", text, torque, limits.torque * limits.motor)
         )
         self._last, self._held = np.array(targets), self.held(targets)
         return trip
@@ -230,8 +230,8 @@ class Safety:
             if not np.isfinite(getattr(measured, name)).all():
                 return Trip("finite", f"what is measured is not finite: {name}")
         for name, (most, unit) in _ABSURD.items():
-            if (found := np.abs(getattr(measured, name)).max()) > most:
-                return Trip("finite", f"what is measured cannot be: {name} of {found:.3g} {unit}")
+            if (value := np.abs(getattr(measured, name)).max()) > most:
+                return Trip("finite", f"what is measured cannot be: {name} of {value:.3g} {unit}")
         if abs((length := float(np.linalg.norm(measured.gravity))) - 1.0) > _UNIT:
             return Trip(
                 "finite", f"what is measured cannot be: gravity of length {length:.2f}, not 1: no orientation comes"
@@ -248,16 +248,16 @@ class Safety:
 
     def _alive(self, measured: Measurement) -> Trip | None:
         """Trip if the measurement is frozen, or one sensor is frozen while others measure motion."""
-        still = measured.joint_pos if self._held is None else self._held
-        parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, still
-        seen = _Seen(*map(np.array, parts))  # copies: a robot may reuse its arrays
-        before = self._seen[-1] if self._seen else seen
-        self._seen.append(seen)
-        self._stuck = np.where(seen.joint_pos == before.joint_pos, self._stuck + 1, 1)
+        target = measured.joint_pos if self._held is None else self._held
+        parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, target
+        signals = _Seen(*map(np.array, parts))  # copies: a robot may reuse its arrays
+        previous = self._seen[-1] if self._seen else signals
+        self._seen.append(signals)
+        self._stuck = np.where(signals.joint_pos == previous.joint_pos, self._stuck + 1, 1)
         self._same["joint_pos"] = int(self._stuck.min())
         for i, name in enumerate(_Seen._fields[1:4], start=1):
-            self._same[name] = self._same[name] + 1 if seen[i].tobytes() == before[i].tobytes() else 1
-            if seen is not before and self._same[name] == 1:
+            self._same[name] = self._same[name] + 1 if signals[i].tobytes() == previous[i].tobytes() else 1
+            if signals is not previous and self._same[name] == 1:
                 self._lived.add(name)
         if (count := min(self._same[name] for name in ("joint_pos", "joint_vel", "ang_vel"))) >= self.limits.frozen:
             return Trip("frozen", f"{count} measurements in a row are the same")
@@ -271,23 +271,24 @@ class Safety:
         """Trip on the first sensor of ``frozen`` or joint of ``stuck`` (D,) that moved according to other sensors."""
         seen = _Seen(*map(np.array, zip(*self._seen, strict=True)))
         count, period = len(seen.joint_pos), self.contract.period
-        told = np.ptp(seen.target[: count - count // 3], axis=0)  # a joint needs time to follow the newest targets
-        went = np.ptp(period * np.cumsum(seen.joint_vel, axis=0), axis=0)
-        moved, leant = float(np.ptp(seen.joint_pos, axis=0).max()), float(np.ptp(seen.gravity, axis=0).max())
-        turned = float(np.ptp(period * np.cumsum(np.cross(seen.ang_vel, seen.gravity), axis=0), axis=0).max())
+        # a joint needs time to follow the newest targets
+        by_target = np.ptp(seen.target[: count - count // 3], axis=0)
+        by_speed = np.ptp(period * np.cumsum(seen.joint_vel, axis=0), axis=0)
+        by_angle, by_gravity = float(np.ptp(seen.joint_pos, axis=0).max()), float(np.ptp(seen.gravity, axis=0).max())
+        by_gyro = float(np.ptp(period * np.cumsum(np.cross(seen.ang_vel, seen.gravity), axis=0), axis=0).max())
         # if a person carries or pushes the robot, the joints may stay still
-        drives = told.max() > _ASKED or (told.max() > _MOVED and max(leant, turned) > _MOVED)
-        moves = {
-            "joint_pos": drives or went.max() > _MOVED,
-            "joint_vel": drives or moved > _MOVED,
-            "ang_vel": moved > _SWUNG or leant > _MOVED,
-            "gravity": moved > _SWUNG or turned > _MOVED,
+        driven = by_target.max() > _ASKED or (by_target.max() > _MOVED and max(by_gravity, by_gyro) > _MOVED)
+        must_move = {
+            "joint_pos": driven or by_speed.max() > _MOVED,
+            "joint_vel": driven or by_angle > _MOVED,
+            "ang_vel": by_angle > _SWUNG or by_gravity > _MOVED,
+            "gravity": by_angle > _SWUNG or by_gyro > _MOVED,
         }
         for name in frozen:
-            if moves[name]:
+            if must_move[name]:
                 return Trip("frozen", f"{name} is the same in {count} measurements in a row, though the robot moves")
-        if (wrong := stuck & ((went > _MOVED) | (told > _ASKED))).any():
-            joint = self.contract.joints[_first(wrong)]
+        if (faulty := stuck & ((by_speed > _MOVED) | (by_target > _ASKED))).any():
+            joint = self.contract.joints[_first(faulty)]
             return Trip(
                 "frozen", f"the angle of {joint} is the same in {count} measurements in a row, though it is driven"
             )
@@ -304,9 +305,9 @@ class Safety:
         return None
 
     def _joints(self, measured: Measurement) -> Trip | None:
-        fast = "turns at {value:.1f} rad/s, more than {most:.1f}"
+        text = "turns at {value:.1f} rad/s, more than {most:.1f}"
         return self._range("position", "is at", measured.joint_pos, self.limits.position) or self._most(
-            "speed", fast, np.abs(measured.joint_vel), self.limits.speed
+            "speed", text, np.abs(measured.joint_vel), self.limits.speed
         )
 
     def _tilt(self, measured: Measurement) -> Trip | None:
@@ -325,8 +326,8 @@ class Safety:
             return Trip("voltage", f"the battery has {health.voltage:.1f} V, less than {self.limits.voltage:g}")
         if health.temperatures is None:
             return None
-        hot = "has a motor of {value:.0f} deg C, more than {most:.0f}"
-        return self._most("temperature", hot, health.temperatures, self.limits.temperature)
+        text = "has a motor of {value:.0f} deg C, more than {most:.0f}"
+        return self._most("temperature", text, health.temperatures, self.limits.temperature)
 
     def _heard(self, health: Health, now: float) -> Trip | None:
         if health.remote is not None:
@@ -339,16 +340,16 @@ class Safety:
 
     def _most(self, limit: str, words: str, values: Floats, most: float | Floats) -> Trip | None:
         most = np.broadcast_to(most, values.shape)
-        if (fine := values <= most).all():
+        if (within := values <= most).all():
             return None
-        joint = _first(~fine)
+        joint = _first(~within)
         return Trip(limit, f"{self.contract.joints[joint]} {words.format(value=values[joint], most=most[joint])}")
 
     def _range(self, limit: str, words: str, values: Floats, margin: float) -> Trip | None:
         low, high = self.limits.low, self.limits.high
-        if (fine := (values >= low - margin) & (values <= high + margin)).all():
+        if (within := (values >= low - margin) & (values <= high + margin)).all():
             return None
-        joint = _first(~fine)
+        joint = _first(~within)
         name, ends = self.contract.joints[joint], f"{low[joint]:.2f} to {high[joint]:.2f}"
         beyond = max(low[joint] - values[joint], values[joint] - high[joint])
         return Trip(

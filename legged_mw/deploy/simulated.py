@@ -155,10 +155,10 @@ class Fleet:
             return
         self._sent = np.concatenate([targets[None], self._sent[: len(self._sent) - 1]])
         for step in range(self.contract.decimation):
-            arrived = self._arrived(step)
+            received = self._arrived(step)
             if self._network:
-                arrived = self._network.torque(arrived - self.qpos[:, self._angles], self.qvel[:, self._dofs])
-            self._ctrl[:, self._actuators] = arrived
+                received = self._network.torque(received - self.qpos[:, self._angles], self.qvel[:, self._dofs])
+            self._ctrl[:, self._actuators] = received
             last = step == self.contract.decimation - 1
             self._step(1, _NOW if last and not self._each else 0)
             if self._each:
@@ -233,8 +233,8 @@ class Fleet:
                 self._batch.expand(name)[:] = getattr(self.model, name)
             if not stiffness.any():
                 motors.limp(self._batch)
-        off = motors.law == "servo" or not stiffness.any()
-        self._batch.expand("dof_damping")[:, dofs] = np.minimum(damping, stable) if off else scene
+        changes_damping = motors.law == "servo" or not stiffness.any()
+        self._batch.expand("dof_damping")[:, dofs] = np.minimum(damping, stable) if changes_damping else scene
 
     def set_delay(self, seconds: Floats) -> None:
         """Delay the targets of each robot's motors by (N,) [s], rounded up to whole physics steps."""
@@ -269,10 +269,10 @@ class Fleet:
 
     def set_friction(self, friction: Floats) -> None:
         """Set the sliding friction (N,) of all contacts of each robot; NaN: the scene's."""
-        given = np.isfinite(friction)
-        self._batch.expand("geom_friction")[given, :, 0] = friction[given, None]
+        mask = np.isfinite(friction)
+        self._batch.expand("geom_friction")[mask, :, 0] = friction[mask, None]
         if self.model.npair:
-            self._batch.expand("pair_friction")[given, :, :2] = friction[given, None, None]
+            self._batch.expand("pair_friction")[mask, :, :2] = friction[mask, None, None]
 
     def _value(self, name: str) -> Floats:
         if name == "gravity":
@@ -349,11 +349,11 @@ class MujocoRobot(Robot):
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         contract, self.hoisted = self.fleet.contract, self.hoisted and stiffness is not None
-        wanted = (
+        gains = (
             contract.stiffness if stiffness is None else stiffness,
             contract.damping if damping is None else damping,
         )
-        self._move(np.asarray(targets), *wanted)
+        self._move(np.asarray(targets), *gains)
 
     def damp(self) -> None:
         self._move(self._targets, 0.0 * self._gains[0], damped(self.fleet.contract))
@@ -492,9 +492,9 @@ def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             "its first keyframe is no pose: the root's quaternion has not length 1, or a value is enormous"
         )
     mujoco.mj_forward(model, data)
-    deep = [contact.dist for contact in data.contact if 0 in model.body_weldid[model.geom_bodyid[contact.geom]]]
+    depths = [contact.dist for contact in data.contact if 0 in model.body_weldid[model.geom_bodyid[contact.geom]]]
     planes = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-    if (lowest := min([0.0, *deep, *(data.qpos[2] - model.geom_pos[planes, 2])])) < -_DEEP:
+    if (lowest := min([0.0, *depths, *(data.qpos[2] - model.geom_pos[planes, 2])])) < -_DEEP:
         raise ValueError(f"its first keyframe is {-lowest:.2g} m under the ground")
 
 
@@ -528,9 +528,9 @@ def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
     """Check that the joint sensors are in the contract's order."""
     for name, sensors in ((name, contract.sensors[name]) for name in ("joint_pos", "joint_vel")):
         for joint, sensor in zip(contract.joints, sensors, strict=True):
-            if (found := model.joint(int(model.sensor(sensor).objid[0])).name) != joint:
+            if (measured := model.joint(int(model.sensor(sensor).objid[0])).name) != joint:
                 raise ContractError(
-                    f"{CONTRACT_FILE}: joints are in another order than sensors: {name}, where {sensor} measures {found} "
+                    f"{CONTRACT_FILE}: joints are in another order than sensors: {name}, where {sensor} measures {measured} "
                     f"in the place of {joint}; export the policy again"
                 )
 
@@ -540,16 +540,16 @@ def _check_machine(
 ) -> None:
     """Check joints, gains, ranges, mass and time step against the contract."""
     if model.nq != 7 + len(joints) or model.nu != len(joints):
-        have = [name for name in _names(model, "joint") if name not in contract.joints]
+        others = [name for name in _names(model, "joint") if name not in contract.joints]
         raise ContractError(
-            f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}"
+            f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(others[1:]) or f'{model.nu} servos'}"
         )
     dofs, motors = model.jnt_dofadr[list(joints)], contract.motors
     stated = {"stiffness": contract.stiffness, "damping": contract.damping}
     stated |= {"motors: stall_torque": motors.stall_torque, "motors: no_load_speed": motors.no_load_speed}
     lowest, highest = target_range(model, actuators)
     checks = {
-        **{name: (stated[name], found) for name, found in contract.motors.gains(model, list(actuators), dofs).items()},
+        **{name: (stated[name], value) for name, value in contract.motors.gains(model, list(actuators), dofs).items()},
         "action: lowest": (contract.action.lowest, lowest),
         "action: highest": (contract.action.highest, highest),
         "robot: mass": (contract.mass, model.body_subtreemass[0]),
@@ -557,9 +557,9 @@ def _check_machine(
     }
     for name, values in checks.items():
         if not np.allclose(*values, rtol=1e-4, atol=1e-6):
-            said, found = (
+            expected, actual = (
                 np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in values
             )
             raise ContractError(
-                f"{CONTRACT_FILE}: {name} is {said}, but {file} has {found}; change both, or export the policy again"
+                f"{CONTRACT_FILE}: {name} is {expected}, but {file} has {actual}; change both, or export the policy again"
             )

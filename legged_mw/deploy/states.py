@@ -63,16 +63,20 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
     """
     if len(seen) <= TURN:
         return ""
-    gyro, gravity, felt = (np.array([getattr(each, name) for each in seen]) for name in _IMU)
-    turns = -period * np.cross(gyro[1:] + gyro[:-1], gravity[1:] + gravity[:-1]) / 4
-    turned, tilted = (np.diff(_in_turns(each), axis=0) for each in (np.cumsum(turns, axis=0), gravity[1:]))
-    by_gyro, by_gravity, missed = (float(np.linalg.norm(each)) for each in (turned, tilted, turned - tilted))
-    if max(by_gyro, by_gravity) > TILTS and missed > MISSED * max(by_gyro, by_gravity):
-        return f"while it stood up gravity tilted by {by_gravity:.2f} rad, by the gyro by {by_gyro:.2f}, and {missed:.2f} do not agree"
-    pull = felt[-round(1.0 / period) :].mean(axis=0)
-    if not PULL[0] < (size := float(np.linalg.norm(pull))) < PULL[1]:
+    gyro, gravity, acceleration = (np.array([getattr(each, name) for each in seen]) for name in _IMU)
+    increments = -period * np.cross(gyro[1:] + gyro[:-1], gravity[1:] + gravity[:-1]) / 4
+    gyro_tilt, gravity_tilt = (
+        np.diff(_in_turns(each), axis=0) for each in (np.cumsum(increments, axis=0), gravity[1:])
+    )
+    by_gyro, by_gravity, difference = (
+        float(np.linalg.norm(each)) for each in (gyro_tilt, gravity_tilt, gyro_tilt - gravity_tilt)
+    )
+    if max(by_gyro, by_gravity) > TILTS and difference > MISSED * max(by_gyro, by_gravity):
+        return f"while it stood up gravity tilted by {by_gravity:.2f} rad, by the gyro by {by_gyro:.2f}, and {difference:.2f} do not agree"
+    mean_acceleration = acceleration[-round(1.0 / period) :].mean(axis=0)
+    if not PULL[0] < (size := float(np.linalg.norm(mean_acceleration))) < PULL[1]:
         return ""
-    angle = math.degrees(math.acos(np.clip(-(pull @ gravity[-1]) / size, -1.0, 1.0)))
+    angle = math.degrees(math.acos(np.clip(-(mean_acceleration @ gravity[-1]) / size, -1.0, 1.0)))
     return f"gravity is {angle:.0f} degrees from what the accelerometer feels" if angle > PLUMB else ""
 
 
@@ -88,10 +92,10 @@ def at_odds(legs: Floats, gravity: Floats) -> str:
         return ""
     legs, gravity = (_in_turns(each[known]) for each in (legs, gravity))
     for name, axis in (("pitched", 0), ("rolled", 1)):
-        by_legs, by_gravity, missed = (float(np.ptp(each[:, axis])) for each in (legs, gravity, legs - gravity))
-        if max(by_legs, by_gravity) > TILTS and missed > MISSED * max(by_legs, by_gravity):
-            both = f"{by_legs:.2f} rad by its legs, by gravity {by_gravity:.2f}"
-            return f"while it stood up it {name} by {both}, and {missed:.2f} do not agree"
+        by_legs, by_gravity, difference = (float(np.ptp(each[:, axis])) for each in (legs, gravity, legs - gravity))
+        if max(by_legs, by_gravity) > TILTS and difference > MISSED * max(by_legs, by_gravity):
+            tilts = f"{by_legs:.2f} rad by its legs, by gravity {by_gravity:.2f}"
+            return f"while it stood up it {name} by {tilts}, and {difference:.2f} do not agree"
     cosine = legs[-1] @ gravity[-1] / np.linalg.norm(legs[-1]) / np.linalg.norm(gravity[-1])
     angle = math.degrees(math.acos(np.clip(cosine, -1.0, 1.0)))
     return f"gravity is {angle:.0f} degrees from where the legs have the ground" if angle > STEEP else ""
@@ -146,17 +150,17 @@ class States:
 
     def listen(self, health: Health, now: float) -> Trip | None:
         """Poll all input sources and set the command. Returns a trip for an emergency stop."""
-        wishes = [source.poll(health) for source in self.sources]
-        driving = next((i for i, wish in enumerate(wishes) if wish.command is not None), None)
-        if driving is None:
+        inputs = [source.poll(health) for source in self.sources]
+        driver = next((i for i, each in enumerate(inputs) if each.command is not None), None)
+        if driver is None:
             command = self._own(now - self.since if self.state == POLICY else 0.0)
         else:
-            command = wishes[driving].command
-            for source in self.sources[driving + 1 :]:
+            command = inputs[driver].command
+            for source in self.sources[driver + 1 :]:
                 source.let_go()
         self.command = self.controller.contract.held(np.asarray(command, dtype=float))
-        self._pressed = frozenset().union(*(wish.pressed for wish in wishes))
-        stop = next((wish.stop for wish in wishes if wish.stop), "")
+        self._pressed = frozenset().union(*(each.pressed for each in inputs))
+        stop = next((each.stop for each in inputs if each.stop), "")
         return Trip("stop", stop) if stop and self.state != DAMPING else None
 
     def step(self, measured: Measurement, now: float) -> Order:
@@ -198,18 +202,18 @@ class States:
     def _begin(self, measured: Measurement, now: float) -> None:
         """Start the policy if the robot stands and the IMU check finds no fault."""
         contract = self.controller.contract
-        off = np.abs(measured.joint_pos - contract.default_pose)
-        if now - self.since < RISE or contract.ends.tilted(measured.gravity) or off.max() > STANDS:
-            joint = contract.joints[int(off.argmax())]
+        error = np.abs(measured.joint_pos - contract.default_pose)
+        if now - self.since < RISE or contract.ends.tilted(measured.gravity) or error.max() > STANDS:
+            joint = contract.joints[int(error.argmax())]
             self._tell(
-                f"{WALK} has to wait until the robot stands: {joint} is {off.max():.2f} rad from its pose after {now - self.since:.1f} s"
+                f"{WALK} has to wait until the robot stands: {joint} is {error.max():.2f} rad from its pose after {now - self.since:.1f} s"
             )
             return
         gravity = np.array([each.gravity for each in self._rise])
-        if why := wrong_imu(self._rise, contract.period) or (
+        if fault := wrong_imu(self._rise, contract.period) or (
             at_odds(np.array(self._down), gravity) if self._legs else ""
         ):
-            self._tell(f"{WALK} is refused: {why}; look at how the IMU's axes are mounted and read")
+            self._tell(f"{WALK} is refused: {fault}; look at how the IMU's axes are mounted and read")
             return
         self.controller.reset()
         self._enter(POLICY, now, f"{END}: damping")

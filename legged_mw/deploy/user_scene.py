@@ -44,10 +44,10 @@ def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[m
         if source.root.tag != "mujoco":
             raise ValueError(f"its first element is <{source.root.tag}>; a scene is an MJCF with the element <mujoco>")
         spec = source.spec()
-        stated = _drop_motors(spec)
+        file_limits = _drop_motors(spec)
         _find_joints(spec, file, contract)
         own = compile_scene(part(folder, SCENE_FILE))
-        _make_ready(spec, contract, _missing_limits(spec, own, contract, stated) | stated)
+        _make_ready(spec, contract, _missing_limits(spec, own, contract, file_limits) | file_limits)
         imu = _find_imu(spec, own, contract)
         _stand(spec, contract, lowest)
         feet = _find_feet(spec, own, contract, lowest)
@@ -57,8 +57,8 @@ def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[m
     except (ValueError, RecursionError) as error:
         if isinstance(error, UserError):
             raise
-        why = str(error).partition("The visual elements of the spec")[0]
-        raise UserError(f"--scene: {file.name} is not a valid MJCF: {' '.join(why.split())}") from None
+        reason = str(error).partition("The visual elements of the spec")[0]
+        raise UserError(f"--scene: {file.name} is not a valid MJCF: {' '.join(reason.split())}") from None
     return spec, _in_scene(model, file, contract, sensors, feet)
 
 
@@ -76,11 +76,11 @@ def _in_scene(
             f"--scene: {file.name} has a time step of {model.opt.timestep:g} s, of which no whole number is the policy's period of "
             f'{contract.period:g} s; write one in it: <option timestep="{contract.timestep:g}"/>'
         )
-    kept = {row.name: row.sensors for row in contract.rows if row.sensors}
+    row_sensors = {row.name: row.sensors for row in contract.rows if row.sensors}
     names = [
         name for i in range(model.nsensor) if not (name := model.sensor(i).name).startswith(("deploy/", "contact/"))
     ]
-    for row, wanted in kept.items():
+    for row, wanted in row_sensors.items():
         for name in wanted:
             if name not in names:
                 raise UserError(f"--scene: observation row '{row}': {unknown('sensor', name, names, file.name)}")
@@ -100,45 +100,45 @@ def _in_scene(
 
 def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
     """Remove the file's actuators and keyframes. Returns joint -> largest torque [N m], where an actuator states it."""
-    found: dict[str, float] = {}
+    limits: dict[str, float] = {}
     for actuator in list(spec.actuators):
         gear = abs(float(actuator.gear[0]))
         force, control = actuator.forcerange, actuator.ctrlrange
         if force[1] > force[0]:
-            found[actuator.target] = gear * float(np.abs(force).max())
+            limits[actuator.target] = gear * float(np.abs(force).max())
         elif actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and control[1] > control[0]:
-            found[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
+            limits[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
         spec.delete(actuator)
     for key in list(spec.keys):  # a keyframe has a control for each actuator
         spec.delete(key)
     spec.nkey = 0
-    return found
+    return limits
 
 
 def _missing_limits(
     spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract, stated: dict[str, float]
 ) -> dict[str, float]:
     """Joint -> the export's torque limit [N m], for joints without a limit in the file."""
-    here, exported = (
+    file_values, export_values = (
         torque_limits(model, [model.joint(name).id for name in contract.joints]) for model in (spec.compile(), own)
     )
-    known = zip(contract.joints, here, exported, strict=True)
+    values = zip(contract.joints, file_values, export_values, strict=True)
     return {
-        name: float(theirs)
-        for name, joints_own, theirs in known
-        if name not in stated and np.isinf(joints_own) and np.isfinite(theirs)
+        name: float(export_limit)
+        for name, file_limit, export_limit in values
+        if name not in stated and np.isinf(file_limit) and np.isfinite(export_limit)
     }
 
 
 def torque_limits(model: mujoco.MjModel, joints: Sequence[int]) -> Floats:
     """(D,) [N m] the smaller torque limit of each joint and its actuator; inf without a limit."""
-    found = np.where(model.jnt_actfrclimited[joints] > 0, np.abs(model.jnt_actfrcrange[joints]).max(axis=1), np.inf)
+    limits = np.where(model.jnt_actfrclimited[joints] > 0, np.abs(model.jnt_actfrcrange[joints]).max(axis=1), np.inf)
     for i, joint in enumerate(joints):
         for actuator in np.flatnonzero(model.actuator_trnid[:, 0] == joint):
             gear = abs(model.actuator_gear[actuator, 0])
             if model.actuator_forcelimited[actuator]:
-                found[i] = min(found[i], gear * np.abs(model.actuator_forcerange[actuator]).max())
-    return found
+                limits[i] = min(limits[i], gear * np.abs(model.actuator_forcerange[actuator]).max())
+    return limits
 
 
 def _find_joints(spec: mujoco.MjSpec, file: Path, contract: Contract) -> None:
@@ -250,13 +250,13 @@ def _find_feet(
 
 def _feel(spec: mujoco.MjSpec, geom: int, name: str) -> str:
     """Add a sensor for contacts of a geom with the ground. Returns its name."""
-    felt: Any = spec.geoms[geom]
-    felt.name = felt.name or name
+    target: Any = spec.geoms[geom]
+    target.name = target.name or name
     spec.add_sensor(
         name=name,
         type=_SENSOR.mjSENS_CONTACT,
         objtype=_OBJECT.mjOBJ_GEOM,
-        objname=felt.name,
+        objname=target.name,
         reftype=_OBJECT.mjOBJ_BODY,
         refname="world",
         intprm=[1, 0, 1],  # it measures the number of contacts
@@ -266,11 +266,11 @@ def _feel(spec: mujoco.MjSpec, geom: int, name: str) -> str:
 
 def _add_sensors(spec: mujoco.MjSpec, contract: Contract, imu: str) -> dict[str, tuple[str, ...]]:
     """Add the contract's sensors with new names. Returns quantity -> sensors."""
-    site, joint, found = _OBJECT.mjOBJ_SITE, _OBJECT.mjOBJ_JOINT, {}
+    site, joint, added = _OBJECT.mjOBJ_SITE, _OBJECT.mjOBJ_JOINT, {}
 
     def add(quantity: str, kind: Any, of: Any, *names: str, **more: Any) -> None:
-        found[quantity] = tuple(f"deploy/{quantity}/{name}" for name in names)
-        for full, name in zip(found[quantity], names, strict=True):
+        added[quantity] = tuple(f"deploy/{quantity}/{name}" for name in names)
+        for full, name in zip(added[quantity], names, strict=True):
             spec.add_sensor(name=full, type=kind, **{"objtype": of, "objname": name, **more})
 
     add("lin_vel", _SENSOR.mjSENS_VELOCIMETER, site, imu)
@@ -281,4 +281,4 @@ def _add_sensors(spec: mujoco.MjSpec, contract: Contract, imu: str) -> dict[str,
     add("joint_pos", _SENSOR.mjSENS_JOINTPOS, joint, *contract.joints)
     add("joint_vel", _SENSOR.mjSENS_JOINTVEL, joint, *contract.joints)
     add("joint_torque", _SENSOR.mjSENS_ACTUATORFRC, _OBJECT.mjOBJ_ACTUATOR, *contract.joints)
-    return found
+    return added

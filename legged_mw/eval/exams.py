@@ -94,10 +94,10 @@ def find_exam(task: LoadedTask) -> Exam | None:
 
 def require_exam(task: LoadedTask) -> Exam:
     """The exam of ``task``. Raises ConfigError if it has none."""
-    if not (found := find_exam(task)):
+    if not (exam := find_exam(task)):
         hint = "A task that walks by command has the walking exam, another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)"
         raise ConfigError(f"--eval: no exam grades task '{task.name}'; there are: {', '.join(EXAMS)}. {hint}")
-    return found
+    return exam
 
 
 def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner | None:
@@ -108,11 +108,11 @@ def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner
     if not (kind := find_exam(task)):
         return None
     examine = kind.in_training(task, env.device, eager)
-    here, there = env.get_observations(), examine.env.get_observations()
+    trained, nominal = env.get_observations(), examine.env.get_observations()
     for group in task.train.obs_groups.actor:
         # the learner reports an unknown group
-        if group in here and here[group].shape[1] != there[group].shape[1]:
-            sizes = f"{there[group].shape[1]} values in the exam's nominal world and {here[group].shape[1]} in training"
+        if group in trained and trained[group].shape[1] != nominal[group].shape[1]:
+            sizes = f"{nominal[group].shape[1]} values in the exam's nominal world and {trained[group].shape[1]} in training"
             print(f"no exam during training: the actor's observation group '{group}' has {sizes}")
             return None
     return examine

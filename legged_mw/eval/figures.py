@@ -100,17 +100,17 @@ def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
 def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any]]:
     """The response to each change of the command, until the next change."""
     borders = [*(np.flatnonzero(np.diff(commanded)) + 1), len(time)]
-    found = []
+    result = []
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         start, target = float(commanded[begin - 1]), float(commanded[begin])
-        found.append(
+        result.append(
             {
                 "from": start,
                 "to": target,
                 **step_response(time[begin:end] - time[begin], mean[begin:end], start, target),
             }
         )
-    return found
+    return result
 
 
 def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: float) -> dict[str, Any]:
@@ -119,12 +119,12 @@ def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: floa
     None if the world fell.
     """
     last = round(seconds / record.dt)
-    found: dict[str, Any] = {"commands": [list(command) for command in commands], "seconds": last * record.dt}
+    result: dict[str, Any] = {"commands": [list(command) for command in commands], "seconds": last * record.dt}
     for name, signal in (("truth", "velocity"), ("estimate", "estimate")):
         values = record.signals[signal][-last:, :, :2].astype(float)
         values[:, np.isfinite(record.fell_at)] = np.nan
-        found[name] = plain(values.transpose(2, 1, 0).reshape(2, -1).round(4))
-    return found
+        result[name] = plain(values.transpose(2, 1, 0).reshape(2, -1).round(4))
+    return result
 
 
 # ---- gait
@@ -151,7 +151,7 @@ def stride_frequency(contact: Array, dt: float) -> float:
 
 def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], seconds: float) -> list[dict[str, Any]]:
     """For each command: duty factors, stride frequency, and the contacts (F, T) in the last ``seconds``."""
-    found = []
+    result = []
     for world, command in enumerate(commands):
         contact, fell = record.signals["contact"][settled:, world], bool(np.isfinite(record.fell_at[world]))
         last = contact[-round(seconds / record.dt) :].T.astype(int).tolist()
@@ -160,8 +160,8 @@ def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], sec
             "stride_frequency": stride_frequency(contact, record.dt),
             "contact": last,
         }
-        found.append({"command": list(command), **(dict.fromkeys(gait) if fell else gait)})
-    return found
+        result.append({"command": list(command), **(dict.fromkeys(gait) if fell else gait)})
+    return result
 
 
 # ---- joints
@@ -195,12 +195,12 @@ def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]])
     ``limits``: signal -> (low, high), each (D,).
     """
     stood = np.isinf(record.fell_at)
-    found = {}
+    result = {}
     for name, (low, high) in limits.items():
         values = record.signals[name][settled:, stood]
         values = values.reshape(-1, values.shape[-1]).astype(float)
-        found[name] = distribution(values, low, high, SATURATED if name == "torque" else 1.0)
-    return found
+        result[name] = distribution(values, low, high, SATURATED if name == "torque" else 1.0)
+    return result
 
 
 # ---- pushes, energy, reward
@@ -280,7 +280,7 @@ def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorL
     most = np.minimum(limits.high, limits.stall_torque)
     near = np.where(np.isfinite(most), NEAR * most, 0.0)
     at_limit = (torque >= high - near) | (torque <= low + near)
-    found = []
+    result = []
     for kind in dict.fromkeys(kinds):
         joints = [i for i, name in enumerate(kinds) if name == kind]
         drawn = {
@@ -288,8 +288,8 @@ def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: MotorL
             **_picture(torque[..., joints].ravel(), speed[..., joints].ravel(), limits.of(joints[0])),
         }
         known = bool(np.isfinite(most[joints]).all()) and stood.any()
-        found.append({**drawn, "at_limit": float(at_limit[..., joints].mean()) if known else None})
-    return found
+        result.append({**drawn, "at_limit": float(at_limit[..., joints].mean()) if known else None})
+    return result
 
 
 def _picture(torque: Array, speed: Array, limits: MotorLimits) -> dict[str, Any]:

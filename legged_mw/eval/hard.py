@@ -86,11 +86,11 @@ def grade_condition(rules: ExamRules, velocity: Array, position: Array, fell_at:
     ``position`` (P, N, 2) [m] are sampled before each of P control steps of ``dt`` [s]. ``fell_at`` (N,): control step
     of the first fall, or inf. If the robot falls, the error of the command is that of standing still.
     """
-    asked = np.array(commands(rules))
-    count, settled = len(asked), round(SETTLING / dt)
+    targets = np.array(commands(rules))
+    count, settled = len(targets), round(SETTLING / dt)
     stood = np.isinf(fell_at)
-    error = np.abs(velocity[settled:, :count] - asked).mean(axis=0, dtype=float)
-    error = np.where(stood[:count, None], error, np.abs(asked))
+    error = np.abs(velocity[settled:, :count] - targets).mean(axis=0, dtype=float)
+    error = np.where(stood[:count, None], error, np.abs(targets))
     drift = float(np.linalg.norm(position[-1, 0] - position[settled, 0]))
     return {
         "falls": int((~stood[:count]).sum()),
@@ -184,23 +184,23 @@ def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def hits(force: Array, down: NDArray[np.bool_], dt: float) -> list[float]:
     """The largest force within TOUCHDOWN after each touchdown of each foot. Touchdowns near the end are left out."""
-    length, found = round(TOUCHDOWN / dt), []
+    length, forces = round(TOUCHDOWN / dt), []
     for foot in range(force.shape[1]):
         starts = [start for start, _ in spans(down[:, foot]) if 0 < start <= len(force) - length]
-        found += [float(force[start : start + length, foot].max()) for start in starts]
-    return found
+        forces += [float(force[start : start + length, foot].max()) for start in starts]
+    return forces
 
 
 def clearances(height: Array, down: NDArray[np.bool_]) -> list[float]:
     """The largest height [m] of each foot in each complete swing, above its mean height in stance."""
-    found = []
+    heights = []
     for foot in range(height.shape[1]):
         if not down[:, foot].any():
             continue
         ground = float(height[down[:, foot], foot].mean())
         swings = [(start, end) for start, end in spans(~down[:, foot]) if start > 0 and end < len(height)]
-        found += [float(height[start:end, foot].max()) - ground for start, end in swings]
-    return found
+        heights += [float(height[start:end, foot].max()) - ground for start, end in swings]
+    return heights
 
 
 def at_limit(values: Array, walk: Walk) -> Array:
@@ -269,8 +269,8 @@ def beside(rules: ExamRules) -> dict[str, Any]:
     alike = common == rules.ranges
     return {
         "policies": list(measured),
-        "errors": {name: [min(axis) for axis in zip(*found, strict=True)] for name, found in errors.items() if alike},
-        "pushes": {name: max(found) for name, found in pushes.items() if found},
+        "errors": {name: [min(axis) for axis in zip(*values, strict=True)] for name, values in errors.items() if alike},
+        "pushes": {name: max(values) for name, values in pushes.items() if values},
         "looks": {name: min(each["looks"][name] for each in every) for name in BETTER},
     }
 
@@ -282,9 +282,9 @@ def beside(rules: ExamRules) -> dict[str, Any]:
 PUSHES, LIMITS, TORQUE, TRUNK, SOLES = 0.9, 0.01, 0.4, 5.0, 3.0
 
 
-def trunk(found: Mapping[str, Any]) -> float:
+def trunk(walk: Mapping[str, Any]) -> float:
     """[deg] largest tilt of the trunk: |mean| + amplitude, the larger of roll and pitch."""
-    return max(abs(found[axis]["mean"]) + found[axis]["amplitude"] for axis in ("roll", "pitch"))
+    return max(abs(walk[axis]["mean"]) + walk[axis]["amplitude"] for axis in ("roll", "pitch"))
 
 
 def finish(
@@ -315,53 +315,53 @@ def finish(
 
 def misses(result: Mapping[str, Any]) -> list[str]:
     """The missed marks in words; empty if the policy is ready for a robot."""
-    conditions, found = result["conditions"], result["looks"]
-    said = [] if result["walks"] else ["does not walk by the walking exam"]
+    conditions, walk = result["conditions"], result["looks"]
+    texts = [] if result["walks"] else ["does not walk by the walking exam"]
     fallen = ["nominal conditions" if name == "none" else name for name, each in conditions.items() if each["falls"]]
-    said += [f"falls under {', '.join(fallen)}"] if fallen else []
+    texts += [f"falls under {', '.join(fallen)}"] if fallen else []
     survived = conditions[ALL]["pushes"]
-    said += [f"survives {survived:.0%} of the pushes under all, not {PUSHES:.0%}"] if survived < PUSHES else []
-    if not found:
-        return [*said, "falls while it is looked at"]
+    texts += [f"survives {survived:.0%} of the pushes under all, not {PUSHES:.0%}"] if survived < PUSHES else []
+    if not walk:
+        return [*texts, "falls while it is looked at"]
     for name in ("angle", "target"):
-        share, joint = found[f"{name}_at_limit"]["worst"], found[f"{name}_at_limit"]["joint"]
-        said += [f"{name} of {joint} at its limit {share:.0%} of the time"] if share > LIMITS else []
-    load = found["torque_over_limit"]
+        share, joint = walk[f"{name}_at_limit"]["worst"], walk[f"{name}_at_limit"]["joint"]
+        texts += [f"{name} of {joint} at its limit {share:.0%} of the time"] if share > LIMITS else []
+    load = walk["torque_over_limit"]
     if load and load["worst"] > TORQUE:
-        said.append(f"torque of {load['joint']} is {load['worst']:.2f} of its limit (RMS), not {TORQUE}")
-    said += [f"trunk tilts by {trunk(found):.1f} degrees, not {TRUNK:g}"] if trunk(found) > TRUNK else []
-    tilt = found["sole_tilt"]
-    return said + ([f"soles tilt by {tilt:.1f} degrees, not {SOLES:g}"] if tilt is not None and tilt > SOLES else [])
+        texts.append(f"torque of {load['joint']} is {load['worst']:.2f} of its limit (RMS), not {TORQUE}")
+    texts += [f"trunk tilts by {trunk(walk):.1f} degrees, not {TRUNK:g}"] if trunk(walk) > TRUNK else []
+    tilt = walk["sole_tilt"]
+    return texts + ([f"soles tilt by {tilt:.1f} degrees, not {SOLES:g}"] if tilt is not None and tilt > SOLES else [])
 
 
 def figures(result: Mapping[str, Any]) -> list[Figure]:
     """The figures of the walk with their marks, as table rows."""
-    found = result["looks"]
-    if not found:
+    walk = result["looks"]
+    if not walk:
         return []
-    hit, torque = (found[key] or {} for key in ("hit", "torque_over_limit"))
+    hit, torque = (walk[key] or {} for key in ("hit", "torque_over_limit"))
     best = result.get("peers", {}).get("looks", {})
     rows = [
-        Figure("trunk's largest tilt [deg]", trunk(found), 1, TRUNK),
-        Figure("  roll, mean", found["roll"]["mean"], 1),
-        Figure("  roll, amplitude", found["roll"]["amplitude"], 1),
-        Figure("  pitch, mean", found["pitch"]["mean"], 1),
-        Figure("  pitch, amplitude", found["pitch"]["amplitude"], 1),
-        Figure("feet apart sideways [m]", found["feet_apart"], 3),
+        Figure("trunk's largest tilt [deg]", trunk(walk), 1, TRUNK),
+        Figure("  roll, mean", walk["roll"]["mean"], 1),
+        Figure("  roll, amplitude", walk["roll"]["amplitude"], 1),
+        Figure("  pitch, mean", walk["pitch"]["mean"], 1),
+        Figure("  pitch, amplitude", walk["pitch"]["amplitude"], 1),
+        Figure("feet apart sideways [m]", walk["feet_apart"], 3),
     ]
-    if found["sole_tilt"] is not None:
-        rows.append(Figure("soles' tilt at stance [deg]", found["sole_tilt"], 1, SOLES))
-    rows.append(Figure("strides of a foot [1/s]", found["strides"], 2))
-    if found["clock"] is not None:
-        rows.append(Figure("  its gait clock", found["clock"], 2))
+    if walk["sole_tilt"] is not None:
+        rows.append(Figure("soles' tilt at stance [deg]", walk["sole_tilt"], 1, SOLES))
+    rows.append(Figure("strides of a foot [1/s]", walk["strides"], 2))
+    if walk["clock"] is not None:
+        rows.append(Figure("  its gait clock", walk["clock"], 2))
     return [
         *rows,
-        Figure("swing clearance [m]", found["clearance"], 3, without="none"),
-        Figure("duty, left minus right", found["duty_left_right"], 3, without="none"),
-        Figure("share of all feet down", found["all_down"], 2),
-        Figure("share of no foot down", found["none_down"], 2),
-        Figure("angle at a limit, worst joint", found["angle_at_limit"]["worst"], 3, LIMITS),
-        Figure("target at a limit, worst joint", found["target_at_limit"]["worst"], 3, LIMITS),
+        Figure("swing clearance [m]", walk["clearance"], 3, without="none"),
+        Figure("duty, left minus right", walk["duty_left_right"], 3, without="none"),
+        Figure("share of all feet down", walk["all_down"], 2),
+        Figure("share of no foot down", walk["none_down"], 2),
+        Figure("angle at a limit, worst joint", walk["angle_at_limit"]["worst"], 3, LIMITS),
+        Figure("target at a limit, worst joint", walk["target_at_limit"]["worst"], 3, LIMITS),
         Figure("hit at touchdown [weights]", hit.get("mean"), 2, None, best.get("hit"), without="none"),
         Figure("  the hardest", hit.get("most"), 2, None, best.get("hardest_hit"), without="none"),
         Figure(
@@ -372,9 +372,9 @@ def figures(result: Mapping[str, Any]) -> list[Figure]:
             best.get("torque_over_limit"),
             without="none",
         ),
-        Figure("target's mean step [rad]", found["target_step"], 3, None, best.get("target_step")),
-        Figure("target's power above 10 Hz", found["fast_share"], 3, None, best.get("fast_share"), without="none"),
-        Figure("peak power [W]", found["peak_power"], 0),
+        Figure("target's mean step [rad]", walk["target_step"], 3, None, best.get("target_step")),
+        Figure("target's power above 10 Hz", walk["fast_share"], 3, None, best.get("fast_share"), without="none"),
+        Figure("peak power [W]", walk["peak_power"], 0),
     ]
 
 

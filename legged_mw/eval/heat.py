@@ -112,7 +112,7 @@ def unknown(ratings: Ratings) -> list[str]:
 
 def reasons(result: Mapping[str, Any]) -> list[str]:
     """The reasons in words why the robot may switch off; empty if the known ratings give none."""
-    found, most = [], result[BATTERY]
+    texts, limit = [], result[BATTERY]
     for name, each in result["phases"].items():
         if not each:
             continue
@@ -121,18 +121,20 @@ def reasons(result: Mapping[str, Any]) -> list[str]:
             later = [each["minutes"][f"{room:g}"][hot] for room in AMBIENTS[1:]]
             others = ", ".join(f"{m:.0f} min at {room:g} C" for m, room in zip(later, AMBIENTS[1:], strict=True))
             time = f"{each['minutes'][cool][hot]:.0f} min {name} at {cool} C"
-            found.append(f"{_short(result, hot)} reaches {HOT:g} C after {time}, {others}")
+            texts.append(f"{_short(result, hot)} reaches {HOT:g} C after {time}, {others}")
         over = _most(each["of_rating"])
         if over is not None and each["of_rating"][over] > 1.0:
             share = f"{each['rms'][over]:.1f} N m RMS {name}, {each['of_rating'][over]:.2f} of its continuous rating"
-            found.append(f"{_short(result, over)} carries {share}: it overheats")
-        if most is not None and each["peak_power"] > most:
-            found.append(f"{_watts(each['peak_power'])} {name}, and the battery gives {_watts(most)}: it may cut power")
-    at = result["switch"]
-    if at and most is not None and at["peak_power"] > most:
-        burst = f"{_watts(at['peak_power'])} for {1000 * at['seconds']:.0f} ms at the switch"
-        found.append(f"{burst}, and the battery gives {_watts(most)}: this robot may cut power")
-    return found
+            texts.append(f"{_short(result, over)} carries {share}: it overheats")
+        if limit is not None and each["peak_power"] > limit:
+            texts.append(
+                f"{_watts(each['peak_power'])} {name}, and the battery gives {_watts(limit)}: it may cut power"
+            )
+    switch = result["switch"]
+    if switch and limit is not None and switch["peak_power"] > limit:
+        burst = f"{_watts(switch['peak_power'])} for {1000 * switch['seconds']:.0f} ms at the switch"
+        texts.append(f"{burst}, and the battery gives {_watts(limit)}: this robot may cut power")
+    return texts
 
 
 def _verdict(result: Mapping[str, Any]) -> bool | None:
@@ -153,23 +155,23 @@ LEAD = (
 
 def lines(result: Mapping[str, Any]) -> list[str]:
     """Lines on heat, torque-speed limit, power, switch and verdict."""
-    said, names = [], result["joints"]
+    texts, names = [], result["joints"]
     for name, each in result["phases"].items():
         if not each:
-            said.append(f"{name}: it fell, so nothing is known")
+            texts.append(f"{name}: it fell, so nothing is known")
             continue
-        said += [f"{name}: {_heat_words(result, each)}", f"{name}: {_limit_words(result, each)}"]
-        said.append(f"{name}: {_power_words(result, each)}")
+        texts += [f"{name}: {_heat_words(result, each)}", f"{name}: {_limit_words(result, each)}"]
+        texts.append(f"{name}: {_power_words(result, each)}")
     if result["switch"] is None and result["switches"]:
-        said.append("switch from stand to policy: it falls at once")
-    if at := result["switch"]:
-        jump = f"{at['target_jump']:.2f} rad ({_bare(at['target_joint'])})"
-        torque = f"{at['torque_jump']:.1f} N m ({_bare(at['torque_joint'])})"
-        burst = f"{_watts(at['peak_power'])} at most, for {1000 * at['seconds']:.0f} ms above half of that"
-        said.append(f"switch from stand to policy: targets jump by {jump}, torque by {torque}; {burst}")
+        texts.append("switch from stand to policy: it falls at once")
+    if switch := result["switch"]:
+        jump = f"{switch['target_jump']:.2f} rad ({_bare(switch['target_joint'])})"
+        torque = f"{switch['torque_jump']:.1f} N m ({_bare(switch['torque_joint'])})"
+        burst = f"{_watts(switch['peak_power'])} at most, for {1000 * switch['seconds']:.0f} ms above half of that"
+        texts.append(f"switch from stand to policy: targets jump by {jump}, torque by {torque}; {burst}")
     if result["unknown"]:
-        said.append(f"unknown of {len(names)} motors and the battery: {', '.join(result['unknown'])}")
-    return [*said, f"will it trip: {verdict(result)}"]
+        texts.append(f"unknown of {len(names)} motors and the battery: {', '.join(result['unknown'])}")
+    return [*texts, f"will it trip: {verdict(result)}"]
 
 
 def verdict(result: Mapping[str, Any]) -> str:
@@ -216,13 +218,13 @@ def _power_words(result: Mapping[str, Any], each: Mapping[str, Any]) -> str:
 
 def rows(result: Mapping[str, Any], most: int | None = None) -> list[list[str]]:
     """A heading, and a row per motor. ``most``: only this many motors with the largest load. No unknown columns."""
-    found = {name: each for name, each in result["phases"].items() if each}
+    phases = {name: each for name, each in result["phases"].items() if each}
     order = range(len(result["joints"]))
-    if most is not None and found:
-        load = np.max([[share or 0.0 for share in each["of_limit"]] for each in found.values()], axis=0)
+    if most is not None and phases:
+        load = np.max([[share or 0.0 for share in each["of_limit"]] for each in phases.values()], axis=0)
         order = np.argsort(-load, kind="stable")[:most].tolist()
     columns = [["", *(_short(result, i) for i in order)]]
-    for name, each in found.items():
+    for name, each in phases.items():
         columns.append([f"{name}: RMS [N m]", *(f"{each['rms'][i]:.1f}" for i in order)])
         for key, title, digits in (("of_limit", "of limit", ".2f"), ("of_rating", "of rating", ".2f")):
             columns.append([title, *(_cell(each[key][i], digits) for i in order)])
@@ -233,13 +235,13 @@ def rows(result: Mapping[str, Any], most: int | None = None) -> list[list[str]]:
 
 def table(result: Mapping[str, Any]) -> str:
     """The result as text."""
-    found = rows(result, LOADED)
-    widths = [max(map(len, column)) for column in zip(*found, strict=True)]
-    said = [f"heat and power: {LEAD.format(count=len(found) - 1, motors=len(result['joints']))}"]
-    for name, *cells in found:
+    cell_rows = rows(result, LOADED)
+    widths = [max(map(len, column)) for column in zip(*cell_rows, strict=True)]
+    texts = [f"heat and power: {LEAD.format(count=len(cell_rows) - 1, motors=len(result['joints']))}"]
+    for name, *cells in cell_rows:
         padded = [f"{cell:>{width}}" for cell, width in zip(cells, widths[1:], strict=True)]
-        said.append("   ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
-    return "\n".join([*said, *lines(result)])
+        texts.append("   ".join([f"{name:<{widths[0]}}", *padded]).rstrip())
+    return "\n".join([*texts, *lines(result)])
 
 
 def _minutes(each: Mapping[str, Any], room: str, i: int) -> str:

@@ -41,8 +41,8 @@ def overrides(task: LoadedTask) -> dict[str, Any]:
     """The exam's changes to the config. Fields that the task lacks are left out."""
     # keep the task's own termination rules
     common = {path: value for path, value in rollout.OVERRIDES.items() if not path.startswith("termination.")}
-    wanted, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
-    return {path: value for path, value in wanted.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
+    changes, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
+    return {path: value for path, value in changes.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
 
 
 def prepare(task: LoadedTask) -> None:
@@ -70,9 +70,9 @@ def examine(kind: str, env: RobotTask, policy: Policy) -> tuple[dict[str, Any], 
     """
     skill, parts, strips = skill_of(env.cfg, kind), {}, {}
     for number, (name, ground) in enumerate(skill.grounds.items()):
-        here = env if number == 0 else on_ground(env, ground)
-        recording = perform(here, policy, skill, ground)
-        parts[name] = skill.judge(machine(here), recording)
+        part_env = env if number == 0 else on_ground(env, ground)
+        recording = perform(part_env, policy, skill, ground)
+        parts[name] = skill.judge(machine(part_env), recording)
         if "worst" in parts[name]:
             strips[name] = recording.qpos[:, parts[name]["worst"]]
     return skill.result(parts), {"strips": _draw(env, strips)}
@@ -130,11 +130,11 @@ def perform(
     forget(policy)
     steps, n = skill.steps(machine(env)), env.num_envs
     states = {"qpos": env.sim.qpos, "qvel": env.sim.qvel, "torque": env.torques}
-    kept = {name: torch.empty(steps, *state.shape, device=env.device) for name, state in states.items()}
+    record = {name: torch.empty(steps, *state.shape, device=env.device) for name, state in states.items()}
     ended_at = torch.full((n,), float("inf"), device=env.device)
     for step in range(steps):
         for name, state in states.items():
-            kept[name][step] = state
+            record[name][step] = state
         with torch.inference_mode():
             actions = policy(obs)
         if (jumps := ground.pushes(step, n, env.dt)) is not None:
@@ -143,7 +143,7 @@ def perform(
         forget(policy, dones)
         ended_at = torch.where(dones & ended_at.isinf(), torch.full_like(ended_at, step), ended_at)
     say_overflow(env.sim, "this exam")
-    arrays = {name: values.cpu().numpy().astype(float) for name, values in kept.items()}
+    arrays = {name: values.cpu().numpy().astype(float) for name, values in record.items()}
     return Recording(**arrays, ended_at=ended_at.cpu().numpy())
 
 
@@ -167,8 +167,8 @@ class InTraining:
 
 def first_part(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> dict[str, float]:
     """The figures, by name, of the exam's part in ``env``. Figures without a value are left out."""
-    found = skill.judge(machine(env), perform(env, policy, skill, starts=starts))
-    return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
+    figures = skill.judge(machine(env), perform(env, policy, skill, starts=starts))
+    return {measure.key: float(value) for measure in skill.measures if (value := figures[measure.key]) is not None}
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -211,9 +211,9 @@ def strip(env: RobotTask, qpos: Floats) -> bytes:
     frames = []
     for step in np.linspace(0, len(qpos) - 1, PICTURES).round().astype(int):
         lines = ((f"{step * env.dt:.1f} s", ""),)
-        there = np.concatenate([qpos[0, :2], qpos[step, 2:]])  # keep x and y at the start, in view of the camera
+        pose = np.concatenate([qpos[0, :2], qpos[step, 2:]])  # keep x and y at the start, in view of the camera
         moment = Moment(
-            step * env.dt, there[None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines
+            step * env.dt, pose[None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines
         )
         frames.append(renderer.frame(moment))
     renderer.close()

@@ -369,17 +369,17 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     """Plot one histogram per joint, all of equal height. Vertical lines are limits. The text is the saturated share."""
     names = [name.removesuffix("_joint") for name in columns[0][1]["joint_names"]]
     for i, (_, figures) in enumerate(columns):
-        found = figures["joints"][key]
-        for joint, (edges, density) in enumerate(zip(found["edges"], found["density"], strict=True)):
-            hill = joint - 0.78 * np.array([*density, density[-1]]) / (max(density) or 1.0)
+        histograms = figures["joints"][key]
+        for joint, (edges, density) in enumerate(zip(histograms["edges"], histograms["density"], strict=True)):
+            curve = joint - 0.78 * np.array([*density, density[-1]]) / (max(density) or 1.0)
             if i == 0:
-                ax.fill_between(edges, joint, hill, step="post", color=PAIR[i], alpha=0.55, linewidth=0)
+                ax.fill_between(edges, joint, curve, step="post", color=PAIR[i], alpha=0.55, linewidth=0)
             else:
-                ax.step(edges, hill, where="post", color=PAIR[i], linewidth=1.0)
-            for end in (found["low"][joint], found["high"][joint]):
+                ax.step(edges, curve, where="post", color=PAIR[i], linewidth=1.0)
+            for end in (histograms["low"][joint], histograms["high"][joint]):
                 if end is not None and i == 0:
                     ax.plot([end, end], [joint, joint - 0.72], color=INK, linewidth=1.2)
-            if share := found["saturated"][joint]:
+            if share := histograms["saturated"][joint]:
                 text = f"{share:.1%}" if share >= 0.001 else "<0.1%"
                 ax.annotate(
                     text, (1.01, joint - 0.1 - 0.4 * i), xycoords=("axes fraction", "data"), color=PAIR[i], fontsize=6.2
@@ -403,14 +403,14 @@ def _motor(motor: Figures, suffix: str, ax: Axes) -> None:
     counts, speeds, torques = (np.array(motor[key], dtype=float) for key in ("counts", "speeds", "torques"))
     # only cells with samples; a full mesh would make the page too large
     rows, columns = np.nonzero(counts)
-    often = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
+    density = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
     ax.bar(
         speeds[columns],
         np.diff(torques)[0],
         np.diff(speeds)[0],
         torques[rows],
         align="edge",
-        color=colormaps[HEAT](1.0 - often),
+        color=colormaps[HEAT](1.0 - density),
         linewidth=0,
     )
     if motor["envelope"]:

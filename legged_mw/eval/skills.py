@@ -122,10 +122,10 @@ class Skill(ABC):
 
     def result(self, parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         """The exam's result, for JSON. ``parts``: name -> return value of ``judge``."""
-        asked = {"kind": self.kind, **asdict(self)}
-        found = {name: {key: _plain(value) for key, value in part.items()} for name, part in parts.items()}
-        passed = all(figure.passes() is not False for part in found for figure in self.figures(found, part))
-        return {"asked": asked, "robots": self.robots, "parts": found, "passed": passed}
+        exam = {"kind": self.kind, **asdict(self)}
+        results = {name: {key: _plain(value) for key, value in part.items()} for name, part in parts.items()}
+        passed = all(figure.passes() is not False for part in results for figure in self.figures(results, part))
+        return {"asked": exam, "robots": self.robots, "parts": results, "passed": passed}
 
     def figures(self, parts: Mapping[str, Mapping[str, Any]], part: str) -> list[Figure]:
         """The figures of one part with their marks."""
@@ -377,26 +377,26 @@ class TrackingExam(Skill):
         assert robot.motion
         motion, model = robot.motion, robot.model
         bodies, anchor = [model.body(name).id for name in motion.bodies], motion.bodies.index(motion.anchor)
-        wanted, wanted_turn = _posed(model, motion.qpos[:, None], bodies)  # (T, 1, B, 3), (T, 1, B, 4)
-        found, turn = _posed(model, recording.qpos, bodies)
-        turned = heading(multiply(turn[:, :, anchor], conjugate(wanted_turn[:, :, anchor])))[:, :, None]
-        there = rotate(turned, wanted - wanted[:, :, anchor, None]) + wanted[:, :, anchor, None]
-        off = found - there
-        off[..., :2] -= (found - wanted)[:, :, anchor, None, :2]
-        error = np.linalg.norm(off, axis=3).mean(axis=2)  # (T, N) [m]
+        reference, reference_turn = _posed(model, motion.qpos[:, None], bodies)  # (T, 1, B, 3), (T, 1, B, 4)
+        actual, turn = _posed(model, recording.qpos, bodies)
+        rotation = heading(multiply(turn[:, :, anchor], conjugate(reference_turn[:, :, anchor])))[:, :, None]
+        aligned = rotate(rotation, reference - reference[:, :, anchor, None]) + reference[:, :, anchor, None]
+        offset = actual - aligned
+        offset[..., :2] -= (actual - reference)[:, :, anchor, None, :2]
+        error = np.linalg.norm(offset, axis=3).mean(axis=2)  # (T, N) [m]
         joints = np.abs(recording.qpos[..., 7:] - motion.qpos[:, None, 7:]).mean(axis=2)
-        up = [1.0 - 2.0 * (q[..., 1] ** 2 + q[..., 2] ** 2) for q in (turn[:, :, anchor], wanted_turn[:, :, anchor])]
-        away = np.abs(found - wanted)[:, :, anchor, 2]
-        lost = ~((away <= LOST_HEIGHT) & (np.abs(up[0] - up[1]) <= LOST_TILT))  # also for NaN
+        up = [1.0 - 2.0 * (q[..., 1] ** 2 + q[..., 2] ** 2) for q in (turn[:, :, anchor], reference_turn[:, :, anchor])]
+        height_error = np.abs(actual - reference)[:, :, anchor, 2]
+        lost = ~((height_error <= LOST_HEIGHT) & (np.abs(up[0] - up[1]) <= LOST_TILT))  # also for NaN
         lost |= ~recording.alive()
         follows = ~np.maximum.accumulate(lost, axis=0)
-        last, kept = follows[-1], follows.sum(axis=0)
-        own = np.where(follows, error, 0.0).sum(axis=0) / np.maximum(kept, 1)
-        drift = np.linalg.norm((found - wanted)[-1, last, anchor, :2], axis=1)
+        last, counts = follows[-1], follows.sum(axis=0)
+        mean_error = np.where(follows, error, 0.0).sum(axis=0) / np.maximum(counts, 1)
+        drift = np.linalg.norm((actual - reference)[-1, last, anchor, :2], axis=1)
         return {
             "finished": float(last.mean()),
             # the first robot that lost the motion, else the robot with the largest error
-            "worst": int(np.argmax(np.where(last, own, FAR - kept))),
+            "worst": int(np.argmax(np.where(last, mean_error, FAR - counts))),
             "body_error": float(1000.0 * error[follows].mean()) if follows.any() else None,
             "joint_error": float(joints[follows].mean()) if follows.any() else None,
             "drift": float(drift.mean()) if last.any() else None,
