@@ -94,7 +94,7 @@ def damped(contract: Contract) -> Floats:
 
 
 class Robot(ABC):
-    """One robot. In each ``contract.period`` the caller calls ``read``, then ``write``. The caller waits.
+    """One robot. In each ``contract.period`` the caller calls ``read``, then ``write``, and waits.
 
     Both calls must take much less than a period. Joints are in the contract's order, not in the robot's.
     The methods that are not abstract are optional.

@@ -211,7 +211,7 @@ class GetupExam(Skill):
         held = _lasting(
             standing(robot, recording), hold
         )  # (T - hold + 1, N) true if it stands for GETUP_HOLD from this step
-        # (N,) first such step; the last index + 1 if there is none
+        # (N,) first such step; len(held) if there is none
         up_at = np.where(held.any(axis=0), held.argmax(axis=0), len(held))
         up = up_at <= limit
         still = held[np.minimum(up_at + stay, len(held) - 1), np.arange(held.shape[1])] & up
