@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from legged_mw.deploy.__main__ import parse as parse_deploy
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.commands import Command
@@ -403,6 +404,12 @@ def test_auto_takes_the_best_there_is_and_says_why(
     monkeypatch.setattr(web, "missing", lambda: None if studio else "no studio")
     chosen, reason = launch.choose(flags(*args), terminal, screen)
     assert chosen == kind and why in reason
+
+
+@pytest.mark.parametrize("what", ["--serve unitree --interface lo", "--robot unitree --interface lo", "--eval"])
+def test_no_viewer_is_no_flag_too_many_where_nothing_is_shown(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["deploy", "go2_flat", *what.split(), "--viewer", "none"])
+    assert parse_deploy().viewer == "none"
 
 
 def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,7 @@ def check_flags(args: argparse.Namespace) -> None:
             "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here"
         )
     given = {name: getattr(args, name) for name in ("eval", "terrain", "video", "sheet")}
-    given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer != "auto"}
+    given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer not in launch.UNSEEN}
     others = [name for name, value in given.items() if value]
     if others:
         raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")

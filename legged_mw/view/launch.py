@@ -21,6 +21,7 @@ from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
 
 VIEWERS = ("auto", "native", "web", "video", "none")
+UNSEEN = ("auto", "none")  # where a program shows nothing, both are the same
 ROBOTS_SHOWN = 64  # at most: drawing more takes longer than a control step
 SECONDS = 10.0  # ours: duration of a recording, or of a run without a viewer
 
@@ -91,10 +92,10 @@ def _widen(values: Sequence[float], table: Sequence[Command]) -> str:
 
 
 def asked(args: argparse.Namespace) -> list[str]:
-    """The flags of ``add_flags`` that the user set."""
-    default = {"viewer": "auto", "camera": "follow", "host": web.LOCAL, "port": 0}
+    """The flags of ``add_flags`` that the user set. ``--viewer none`` asks for nothing."""
+    default = {"viewer": UNSEEN, "camera": ("follow",), "host": (web.LOCAL,), "port": (0,)}
     names = ("viewer", "video", "sheet", "commands", "camera", "host", "port")
-    return [f"--{name}" for name in names if getattr(args, name) != default.get(name)]
+    return [f"--{name}" for name in names if getattr(args, name) not in default.get(name, (None,))]
 
 
 def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str, str]:
