@@ -430,6 +430,17 @@ def test_a_batch_job_gets_a_video_and_a_sheet(
     assert "(no screen here, and no terminal" in capsys.readouterr().out
 
 
+def test_a_slow_recording_says_how_long_it_takes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for second, said in [(4.0, "about 12 s to go"), (0.4, "")]:  # that the first second of four takes
+        stage = FakeStage()
+        clock = SimpleNamespace(perf_counter=lambda stage=stage, second=second: stage.steps * stage.dt * second)
+        monkeypatch.setattr("legged_mw.view.session.time", clock)
+        Session(stage, launch.NoViewer(), Pilot(THREE, 2), seconds=4.0, real_time=False).run()
+        assert capsys.readouterr().out.strip() == said
+
+
 def test_a_window_that_cannot_open_does_not_leave_a_batch_job_waiting(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -193,10 +193,7 @@ def _recorder(
         if (reason := no_encoder()) is not None:  # the user did not name a video
             print(f"no video: {reason}")
             video = None
-    print(
-        f"viewer: {seconds:g} s of {' and '.join(_names(video, sheet))} ({why}); without a GPU for drawing it takes a while",
-        flush=True,
-    )
+    print(f"viewer: recording {seconds:g} s to {' and '.join(_names(video, sheet))} ({why})", flush=True)
     return Recorder(stage.spec, pilot.num_worlds, stage.dt, seconds, video=video, sheet=sheet, **size)
 
 
