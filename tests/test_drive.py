@@ -725,6 +725,12 @@ SLOW = """currentModelCrc = 1; Module.session_id = "7"; new WebSocket(origin.rep
 (function frame() { const end = performance.now() + 300; while (performance.now() < end); requestAnimationFrame(frame); })()"""
 
 
+# the tab is hidden or shown; a stand-in for Studio's link shows what is asked there
+SEEN = """(hidden) => { Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
+session = { send: (word) => { document.title = word; } }; document.dispatchEvent(new Event("visibilitychange")); }"""
+ASK = """new WebSocket(origin.replace("http", "ws") + "/ui?sid=7")"""
+
+
 @pytest.mark.browser
 def test_a_slow_browser_gets_pictures_and_no_short_key_is_lost() -> None:
     from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
@@ -752,9 +758,17 @@ def test_a_slow_browser_gets_pictures_and_no_short_key_is_lost() -> None:
         tab.goto(f"{page.url}#browser")
         tab.wait_for_function("shown.length > 3")
         assert pressed(tab) == 3 and tab.url.endswith("#browser")  # as asked, however slow
+        tab.evaluate(SEEN, True)  # a hidden tab leaves, so that another page drives
+        other = browser.new_page()
+        other.goto(f"{page.url}drawn")
+        other.wait_for_function("facts?.drives")
+        tab.evaluate(SEEN, False)
+        tab.evaluate(ASK)
+        tab.wait_for_function("document.title === 'request_control'")  # refused, it joins the queue
+        other.close()
         tab.goto(f"{page.url}?")
         tab.wait_for_url("**/drawn#*")
-        tab.wait_for_function("times.length > 1")
+        tab.wait_for_function("facts?.drives && times.length > 1")
         assert pressed(tab) == 3 and "drawn by the server" in tab.inner_text("#how")
         assert tab.evaluate("document.documentElement.scrollWidth") == 390 and not tab.is_visible("#buttons")
         tab.click("#title")
