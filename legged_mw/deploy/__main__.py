@@ -255,7 +255,7 @@ def main() -> None:
 
 def find(name: str) -> Path:
     """The folder of an export, or of the shipped policy of this name. Raises UserError if there is neither."""
-    if (folder := typed(name)).exists():
+    if (folder := typed(name)).is_dir():
         return check_folder(folder)
     if not (SHIPPED / name).is_dir():
         there = sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONTRACT_FILE}"))

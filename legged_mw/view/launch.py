@@ -53,16 +53,14 @@ def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse invalid flags before anything is loaded. Raises FlagError or ViewError."""
+    """Refuse invalid flags before anything is loaded. Raises FlagError, UserError or ViewError."""
     files = [flag for flag in ("video", "sheet") if getattr(args, flag) is not None]
     if files and args.viewer not in ("auto", "video"):
         raise FlagError(f"--{files[0]} records and --viewer {args.viewer} does not: leave one of them out")
     for flag in files:
-        writable(getattr(args, flag), f"--{flag}")
+        writable(getattr(args, flag), f"--{flag}", suffix=".png" if flag == "sheet" else "")
     if args.video:
         check_format(Path(args.video))
-    if args.sheet and Path(args.sheet).suffix.lower() != ".png":
-        raise ViewError(f"Cannot write {Path(args.sheet).name!r}: a contact sheet is a .png.")
     if not 0 <= args.port < 65536:
         raise FlagError(f"--port {args.port}: a port is a number from 1 to 65535")
 
