@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from legged_mw.deploy.__main__ import parse as parse_deploy
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.commands import Command
@@ -405,6 +406,12 @@ def test_auto_takes_the_best_there_is_and_says_why(
     assert chosen == kind and why in reason
 
 
+@pytest.mark.parametrize("what", ["--serve unitree --interface lo", "--robot unitree --interface lo", "--eval"])
+def test_no_viewer_is_no_flag_too_many_where_nothing_is_shown(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["deploy", "go2_flat", *what.split(), "--viewer", "none"])
+    assert parse_deploy().viewer == "none"
+
+
 def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = script(tmp_path, "commands: [{time: 0, command: [0.5, 0, 0]}]")
     outcome = launch.watch(FakeStage(), flags("--viewer", "none", "--commands", str(drive)), tmp_path)
@@ -421,6 +428,17 @@ def test_a_batch_job_gets_a_video_and_a_sheet(
     launch.watch(FakeStage(), flags("--time", "0.2"), tmp_path, **picture)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["play.mp4", "play.png"]
     assert "(no screen here, and no terminal" in capsys.readouterr().out
+
+
+def test_a_slow_recording_says_how_long_it_takes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for second, said in [(4.0, "about 12 s to go"), (0.4, "")]:  # that the first second of four takes
+        stage = FakeStage()
+        clock = SimpleNamespace(perf_counter=lambda stage=stage, second=second: stage.steps * stage.dt * second)
+        monkeypatch.setattr("legged_mw.view.session.time", clock)
+        Session(stage, launch.NoViewer(), Pilot(THREE, 2), seconds=4.0, real_time=False).run()
+        assert capsys.readouterr().out.strip() == said
 
 
 def test_a_window_that_cannot_open_does_not_leave_a_batch_job_waiting(
@@ -707,6 +725,12 @@ SLOW = """currentModelCrc = 1; Module.session_id = "7"; new WebSocket(origin.rep
 (function frame() { const end = performance.now() + 300; while (performance.now() < end); requestAnimationFrame(frame); })()"""
 
 
+# the tab is hidden or shown; a stand-in for Studio's link shows what is asked there
+SEEN = """(hidden) => { Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
+session = { send: (word) => { document.title = word; } }; document.dispatchEvent(new Event("visibilitychange")); }"""
+ASK = """new WebSocket(origin.replace("http", "ws") + "/ui?sid=7")"""
+
+
 @pytest.mark.browser
 def test_a_slow_browser_gets_pictures_and_no_short_key_is_lost() -> None:
     from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
@@ -734,9 +758,17 @@ def test_a_slow_browser_gets_pictures_and_no_short_key_is_lost() -> None:
         tab.goto(f"{page.url}#browser")
         tab.wait_for_function("shown.length > 3")
         assert pressed(tab) == 3 and tab.url.endswith("#browser")  # as asked, however slow
+        tab.evaluate(SEEN, True)  # a hidden tab leaves, so that another page drives
+        other = browser.new_page()
+        other.goto(f"{page.url}drawn")
+        other.wait_for_function("facts?.drives")
+        tab.evaluate(SEEN, False)
+        tab.evaluate(ASK)
+        tab.wait_for_function("document.title === 'request_control'")  # refused, it joins the queue
+        other.close()
         tab.goto(f"{page.url}?")
         tab.wait_for_url("**/drawn#*")
-        tab.wait_for_function("times.length > 1")
+        tab.wait_for_function("facts?.drives && times.length > 1")
         assert pressed(tab) == 3 and "drawn by the server" in tab.inner_text("#how")
         assert tab.evaluate("document.documentElement.scrollWidth") == 390 and not tab.is_visible("#buttons")
         tab.click("#title")

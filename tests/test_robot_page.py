@@ -313,7 +313,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_page(
 def test_picture_wants_check_and_a_png(tmp_path: Path) -> None:
     assert "--picture draws what --check shows: add --check" in refused(tmp_path, "train", *SMALL, "--picture", "a.png")
     text = refused(tmp_path, "train", *SMALL, "--check", "--picture", "robot.jpg")
-    assert "Cannot write 'robot.jpg': the picture of a robot is a .png" in text
+    assert "this writes a .png; end the name in .png" in text
     lost = refused(tmp_path, "train", *SMALL, "--check", "--picture", "/proc/none/robot.png")
     assert "--picture /proc/none/robot.png: cannot be written: " in lost
 

@@ -239,6 +239,9 @@ def test_warm_steps_each_task(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     program("warm", "go1_flat", "--device", "cpu", monkeypatch=monkeypatch)
     assert warmed == [("go1_flat", "cpu"), ("go1_flat",)]
     assert "on a CPU MuJoCo's own engine trains: few kernels" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        program("warm", "go1_flat", "nosuch", "--device", "cpu", monkeypatch=monkeypatch)
+    assert len(warmed) == 2  # a wrong name is refused before the first task compiles
 
 
 def test_warm_trains_an_iteration(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,7 @@ def check_flags(args: argparse.Namespace) -> None:
             "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here"
         )
     given = {name: getattr(args, name) for name in ("eval", "terrain", "video", "sheet")}
-    given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer != "auto"}
+    given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer not in launch.UNSEEN}
     others = [name for name, value in given.items() if value]
     if others:
         raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")
@@ -255,7 +255,7 @@ def main() -> None:
 
 def find(name: str) -> Path:
     """The folder of an export, or of the shipped policy of this name. Raises UserError if there is neither."""
-    if (folder := typed(name)).exists():
+    if (folder := typed(name)).is_dir():
         return check_folder(folder)
     if not (SHIPPED / name).is_dir():
         there = sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONTRACT_FILE}"))

@@ -103,7 +103,9 @@ class Gamepad(RobotRemote):
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise RobotError(f"no gamepad at {path}: {error.strerror}") from None
+            raise RobotError(
+                f"no gamepad at {path}: {error.strerror}; name one such as /dev/input/js0, or off"
+            ) from None
         self.path, self._sticks = path, dict[str, float]()
         self._buttons, self._lost = set[str](), False
 

@@ -42,7 +42,7 @@ from legged_mw.utils.files import check_name
 FORMAT = 1
 CHUNK = 100  # steps per block
 BACKLOG = 60  # largest number of blocks in the queue; it limits the memory if the disk is slow
-SUFFIX = ".lmwlog"
+LOGS, SUFFIX = Path("logs/deploy"), ".lmwlog"
 # files of an export to copy into a log, if they exist
 EXPORT = (CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, MOTORS_FILE, MOTION_FILE, TERRAIN_FILE)
 _LENGTH = struct.Struct("<Q")
@@ -52,7 +52,7 @@ class LogError(UserError, ValueError):
     """The file is not a log or cannot be written."""
 
 
-def log_path(contract: Contract, folder: Path = Path("logs/deploy")) -> Path:
+def log_path(contract: Contract, folder: Path = LOGS) -> Path:
     """The default path of a run's log."""
     return (
         folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
@@ -221,7 +221,7 @@ def read_log(path: Path) -> DriveLog:
         events = [(float(now), str(text)) for block in blocks for now, text in json.loads(str(block["events"]))]
         readable = header["format"] == FORMAT
     except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror}") from None
+        raise LogError(f"cannot read {path}: {error.strerror}; a robot that is driven writes logs to {LOGS}") from None
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         raise LogError(f"{path} is no log of legged_mw.deploy") from None
     if not readable:

@@ -39,7 +39,7 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
     )
     args = parser.parse_args(argv)
     if args.picture is not None:
-        writable(args.picture, "--picture")
+        writable(args.picture, "--picture", suffix=".png")
         if not args.check:
             parser.error("--picture draws what --check shows: add --check")
     if not args.list:

@@ -39,7 +39,7 @@ def parse() -> argparse.Namespace:
     )
     args = parser.parse_args()
     if args.picture is not None:
-        writable(args.picture, "--picture")
+        writable(args.picture, "--picture", suffix=".png")
     if args.new and Path(args.file).suffix not in ROBOT_FILES:
         parser.error(f"--new makes a task for a robot's file ({', '.join(ROBOT_FILES)}); {args.file} is a task already")
     return args

@@ -59,8 +59,6 @@ class Label(NamedTuple):
 
 def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], title: str) -> None:
     """Write the picture of the robot at ``qpos`` (7 + D,) to ``path`` (PNG). ``feet``: name -> geoms."""
-    if path.suffix.lower() != ".png":
-        raise ViewError(f"Cannot write {path.name!r}: the picture of a robot is a .png")
     scene = _Picture(robot, qpos, feet)
     try:
         save_png(path, np.concatenate([scene.view(*view, title) for view in VIEWS], axis=1))

@@ -28,6 +28,8 @@ def main() -> None:
     parser.add_argument("--device", metavar="D", help="cuda:0, cpu (default: the GPU if there is one)")
     args = parser.parse_args()
     device = pick_device(args.device)
+    for name in args.tasks:
+        load_task(name, say=True)  # a wrong name is refused before the first one compiles
     if device == "cpu":
         print(
             "on a CPU MuJoCo's own engine trains: few kernels; most of these are for --engine mujoco_warp", flush=True
@@ -45,7 +47,7 @@ def main() -> None:
 
 def warm(name: str, device: str) -> None:
     """Train a task for one iteration and step its exam, which compiles all kernels of its training."""
-    task = load_task(name, say=True)
+    task = load_task(name)
     if device == "cpu":
         fit_cpu(task, usable_cores())
         torch.set_num_threads(1)  # as train.py does

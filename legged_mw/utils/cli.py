@@ -121,10 +121,9 @@ def seed_everything(seed: int) -> None:
 
 def positive(text: str) -> int:
     """A positive whole number, for argparse."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is not a positive number")
-    return value
+    if not re.fullmatch(r"\+?[\d_]+", text, re.ASCII) or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive whole number")
+    return int(text)
 
 
 def number(kind: Any) -> Callable[[str], Any]:

@@ -55,10 +55,10 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
 
 
-def writable(name: str, flag: str, folder: bool = False) -> Path:
+def writable(name: str, flag: str, folder: bool = False, suffix: str = "") -> Path:
     """The file or folder that ``flag`` wants written. Raises UserError, before any work, if that is not possible.
 
-    Folders on the way need not exist. The check leaves nothing behind.
+    ``suffix``: the only one that the file may have. Folders on the way need not exist. The check leaves nothing behind.
     """
     path = Path(name)
     kind, other = ("folder", "file") if folder else ("file", "folder")
@@ -69,6 +69,8 @@ def writable(name: str, flag: str, folder: bool = False) -> Path:
             path.lstat()  # raises for a name that no file can have
         if path.exists() and path.is_dir() != folder:
             raise UserError(f"{flag} {name}: that is a {other}; name a {kind}")
+        if suffix and path.suffix.lower() != suffix:
+            raise UserError(f"{flag} {name}: this writes a {suffix}; end the name in {suffix}")
         there = next(place for place in (path.absolute(), *path.absolute().parents) if place.exists())
         if there.is_file() and there != path.absolute():
             raise UserError(f"{flag} {name}: {there} is a file, not a folder")
@@ -170,7 +172,7 @@ def read_arrays(file: Path) -> dict[str, Any]:
     except TypeError:
         raise ValueError("it is one array, no archive of them") from None
     except Exception as error:  # numpy's, zipfile's or zlib's
-        raise ValueError(" ".join(str(error).split())[:200]) from None
+        raise ValueError(" ".join(str(getattr(error, "strerror", None) or error).split())[:200]) from None
 
 
 def digest(file: Path) -> str:

@@ -112,7 +112,7 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
             text = file.read(MOST_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         why = getattr(error, "strerror", None) or error
-        raise ConfigError(f"{path}: cannot read this config file: {why}") from None
+        raise ConfigError(f"{path}: cannot read this file: {why}") from None
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{path}: larger than {MOST_BYTES >> 20} MiB, which no config is")
     loaded = parse_yaml(text, str(path))

@@ -21,6 +21,7 @@ from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
 
 VIEWERS = ("auto", "native", "web", "video", "none")
+UNSEEN = ("auto", "none")  # where a program shows nothing, both are the same
 ROBOTS_SHOWN = 64  # at most: drawing more takes longer than a control step
 SECONDS = 10.0  # ours: duration of a recording, or of a run without a viewer
 
@@ -52,16 +53,14 @@ def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse invalid flags before anything is loaded. Raises FlagError or ViewError."""
+    """Refuse invalid flags before anything is loaded. Raises FlagError, UserError or ViewError."""
     files = [flag for flag in ("video", "sheet") if getattr(args, flag) is not None]
     if files and args.viewer not in ("auto", "video"):
         raise FlagError(f"--{files[0]} records and --viewer {args.viewer} does not: leave one of them out")
     for flag in files:
-        writable(getattr(args, flag), f"--{flag}")
+        writable(getattr(args, flag), f"--{flag}", suffix=".png" if flag == "sheet" else "")
     if args.video:
         check_format(Path(args.video))
-    if args.sheet and Path(args.sheet).suffix.lower() != ".png":
-        raise ViewError(f"Cannot write {Path(args.sheet).name!r}: a contact sheet is a .png.")
     if not 0 <= args.port < 65536:
         raise FlagError(f"--port {args.port}: a port is a number from 1 to 65535")
 
@@ -91,10 +90,10 @@ def _widen(values: Sequence[float], table: Sequence[Command]) -> str:
 
 
 def asked(args: argparse.Namespace) -> list[str]:
-    """The flags of ``add_flags`` that the user set."""
-    default = {"viewer": "auto", "camera": "follow", "host": web.LOCAL, "port": 0}
+    """The flags of ``add_flags`` that the user set. ``--viewer none`` asks for nothing."""
+    default = {"viewer": UNSEEN, "camera": ("follow",), "host": (web.LOCAL,), "port": (0,)}
     names = ("viewer", "video", "sheet", "commands", "camera", "host", "port")
-    return [f"--{name}" for name in names if getattr(args, name) != default.get(name)]
+    return [f"--{name}" for name in names if getattr(args, name) not in default.get(name, (None,))]
 
 
 def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str, str]:
@@ -192,10 +191,7 @@ def _recorder(
         if (reason := no_encoder()) is not None:  # the user did not name a video
             print(f"no video: {reason}")
             video = None
-    print(
-        f"viewer: {seconds:g} s of {' and '.join(_names(video, sheet))} ({why}); without a GPU for drawing it takes a while",
-        flush=True,
-    )
+    print(f"viewer: recording {seconds:g} s to {' and '.join(_names(video, sheet))} ({why})", flush=True)
     return Recorder(stage.spec, pilot.num_worlds, stage.dt, seconds, video=video, sheet=sheet, **size)
 
 

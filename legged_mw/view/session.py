@@ -18,6 +18,7 @@ from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Vie
 FALL_SECONDS = 2.0  # ours: [s] display time of the place of a fall
 SETTLING = 1.0  # [s] ours: start of a segment to leave out of its mean velocity, if it lasts longer than twice this
 PACE_SECONDS = 0.5  # [s] interval for measuring the pace
+PATIENT = 3.0  # [s] ours: a recording that takes longer says how long
 MEASURED = ", ".join(LABELS.values())
 
 
@@ -122,6 +123,15 @@ class Session:
         if self.real_time:
             self._pace.dt = self.stage.dt / (1.0 if self.pilot.paused else self.pilot.speed)
             self._pace.wait()
+        elif self.steps == round(1.0 / self.stage.dt):
+            self._say_how_long()
+
+    def _say_how_long(self) -> None:
+        """Print how long the rest takes, by the first second. Drawing without a GPU takes several times real time."""
+        begun, _, _ = self._measured
+        left = (time.perf_counter() - begun) * ((self.seconds or 0.0) / self.time - 1.0)
+        if left > PATIENT:
+            print(f"  about {left:.0f} s to go", flush=True)
 
     def _listen(self) -> None:
         pilot, stage = self.pilot, self.stage

@@ -23,7 +23,7 @@ nosuch
 go1_falt
 go1_flat --eval --command=0,0,0
 go1_flat --eval --terrain
-go1_flat --eval --viewer none
+go1_flat --eval --viewer web
 go1_flat --eval --ranges common
 go1_flat --switch fall
 go1_flat go2_flat
