@@ -32,7 +32,7 @@ from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 
 Points = Annotated[list[Annotated[float, at_least(-100, 100, "m")]], SOME]
-ShareRange = Annotated[list[Share], PAIR]
+Difficulties = Annotated[list[Annotated[float, at_least(0, 2)]], PAIR]
 Swing = Annotated[float, above(0, 10, "m")]  # height of a foot in its swing
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
@@ -128,7 +128,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         tile_size: Positive = 8.0  # edge of a tile [m] [L]
         horizontal_scale: CellSize = 0.05  # between two heights [m] [ours: L 0.1 makes a stair a slope of 50 degrees]
         border_size: Border = 5.0  # flat ground around all tiles; past its middle an episode times out [m] [L 25]
-        difficulty: ShareRange = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
+        difficulty: Difficulties = [0.0, 1.0]  # of the first and the last row: 0 easy, 1 hard, 2 at most [L]
         # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
         terrain_proportions: dict[str, NonNegative] = {
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
