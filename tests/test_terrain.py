@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from legged_mw.sim.height_map import HeightMap
 from legged_mw.sim.terrain import (
     KINDS,
     LEVEL,
-    MEASURES,
     PLATFORM,
     Grid,
     Heights,
@@ -184,17 +182,6 @@ def test_a_lookup_by_hand_at_the_rim_and_beyond() -> None:
 
 
 # ---- kinds of one's own
-
-
-@pytest.fixture
-def own_kinds() -> Iterator[None]:
-    """What a test adds is gone after it."""
-    tables = (KINDS, MEASURES, LEVEL)
-    before = [table.copy() for table in tables]
-    yield
-    for table, kept in zip(tables, before, strict=True):
-        table.clear()
-        table.update(kept)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("own_kinds")
