@@ -18,6 +18,7 @@ import torch
 from onnxscript._framework_apis import torch_2_5 as onnxscript_for_torch
 from program import trained
 
+from legged_mw.sim.terrain import KINDS, LEVEL, MEASURES
 from legged_mw.view.native import has_display
 
 # The exporter looks at each of the 500 functions that it can write, at every export: once a process is enough.
@@ -102,3 +103,14 @@ def double() -> Iterator[None]:
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
+
+
+@pytest.fixture
+def own_kinds() -> Iterator[None]:
+    """Kinds of ground that a test adds are gone after it."""
+    tables = (KINDS, MEASURES, LEVEL)
+    before = [table.copy() for table in tables]
+    yield
+    for table, kept in zip(tables, before, strict=True):
+        table.clear()
+        table.update(kept)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks import heights, memory, step
+from legged_mw.envs.legged_robot import LeggedRobot
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
@@ -47,8 +48,33 @@ def test_another_failure_is_not_taken_for_want_of_memory(monkeypatch: pytest.Mon
     )
 
 
-def test_as_many_robots_as_asked_stand_before_each_height() -> None:
-    low, high = 6.0, 19.5
-    asked, crossed = heights.shares("go2_rough", "stairs_up", low, high, repeats=1, engine="mujoco", device="cpu")
-    assert (asked[0], asked[-1], len(asked), len(crossed)) == (low, high, 10, 10)
-    assert crossed[:3] == [1.0] * 3  # steps of 9 cm and less; it ships with 1.0 up to 15 cm
+@pytest.mark.usefixtures("own_kinds")
+def test_robots_stand_before_each_height_that_is_asked_for_both_ways(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two robots a height on one row of tiles; each ground is as high as it says."""
+    seen: list[Any] = []
+
+    def run_crossing(env: LeggedRobot, policy: Any, speed: float) -> dict[str, Any]:
+        seen.append((env, speed))
+        return {"kinds": {kind: {"crossed": [i / 4]} for i, kind in enumerate(env.tiles.kinds)}} if env.tiles else {}
+
+    monkeypatch.setattr(heights.rough, "run_crossing", run_crossing)
+    ground = ["--ground", "stairs_up", "9", "25", "--ground", "smooth_slope", "57"]
+    monkeypatch.setattr("sys.argv", ["heights.py", "go2_rough", *ground, "--backwards", "--robots", "2"])
+    heights.main()
+    (env, speed), (_, back) = seen
+    names = ("stairs_up, step 9 cm", "stairs_up, step 25 cm", "smooth_slope, slope 57 %")
+    assert (speed, back, env.num_envs) == (0.6, -0.6, 6) and env.tiles.kinds == names
+    assert env.terrain.origins[0, :4, 2].tolist() == pytest.approx([-8 * 0.09] * 2 + [-8 * 0.25] * 2)
+    assert sorted(env.terrain.origins[0, 4:, 2]) == pytest.approx([-0.57 * 2.5, 0.57 * 2.5]), "a pyramid and a pit"
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[1].split() == ["friction,", "way", "0.6", "ahead", "0.6", "back"]
+    assert [row.split()[-2:] for row in rows[2:]] == [["0.00"] * 2, ["0.25"] * 2, ["0.50"] * 2]
+
+
+@pytest.mark.usefixtures("own_kinds")
+def test_robots_that_walk_backwards_cross_low_stairs() -> None:
+    (ground,) = heights.add_ground("stairs_up", "7")
+    asked = {"friction": 1.0, "repeats": 1, "engine": "mujoco", "device": "cpu"}
+    assert heights.crossed("go2_rough", [ground], speed=-0.6, **asked) == [1.0]

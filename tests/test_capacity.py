@@ -78,6 +78,7 @@ def test_terrain_wants_more() -> None:
     assert count_capacity(walker(BALL), terrain=True).rows > 4 + 4 * 2 * 2
     stick = count_capacity(walker(STICK), terrain=True)
     assert 4 + 4 * 2 * 3 < stick.rows < 4 + 4 * 2 * 8
+    assert count_capacity(walker(STICK.replace("capsule", "cylinder")), terrain=True).rows == stick.rows
 
 
 @pytest.mark.parametrize(("task", "counted"), [("go1_flat", (8, 40)), ("go1_rough", (8, 56))])

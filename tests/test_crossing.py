@@ -92,6 +92,8 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
     yaw = 2.0 * torch.atan2(places[0][:, 6], places[0][:, 3])
     assert len(yaw.unique()) == env.num_envs == 60 * TILES and yaw.min() < -2.5 and yaw.max() > 2.5
     assert all((seen == torch.tensor([rough.SPEED, 0.0, 0.0])).all() for seen in asked) and len(asked) == 3
+    assert rough.run_crossing(env, policy, -0.4)["speed"] == -0.4
+    assert (asked[-1] == torch.tensor([-0.4, 0.0, 0.0])).all()
 
 
 def test_the_same_whatever_the_seed_and_nothing_drawn_outside(monkeypatch: pytest.MonkeyPatch) -> None:

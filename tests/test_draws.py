@@ -71,6 +71,33 @@ def test_command_settings_reach_the_draw() -> None:
     assert (y == 0.0).all() and yaw.min() >= -0.2 and yaw.max() <= -0.1
 
 
+def test_a_share_of_new_commands_is_at_an_end_of_its_range() -> None:
+    """Either end as often, each command for itself; at rest as often as without it."""
+    env = make_env(
+        N,
+        {
+            "commands.change_probability": 1.0,
+            "commands.keep_probability": [1.0, 1.0, 0.5],
+            "commands.end_probability": 0.4,
+            "commands.ranges.lin_vel_x": [-0.5, 1.0],
+        },
+    )
+    draws = []
+    for draw in (env._resample_commands, env._reset_commands):
+        for _ in range(200):
+            draw(torch.ones(N, dtype=torch.bool))
+            draws.append(env.commands.clone())
+    x, low, high = torch.stack(draws), *env.command_ranges
+    share = torch.stack([(x == low).float(), (x == high).float()]).mean(dim=1)  # (2, worlds, commands)
+    again, reset = (x[part] for part in (slice(200), slice(200, None)))
+    assert (share.mean(dim=1)[:, :2] - 0.2).abs().max() < 0.01  # +- 0.003
+    assert abs((again[..., 2] == 0.0).float().mean() - 0.5) < 0.02 and (reset[..., 2] != 0.0).all()
+    both = (x == high).flatten(0, 1).float().T.corrcoef()
+    assert abs(both[0, 1]) < 0.02
+    inside = x[..., 0][(x[..., 0] != low[0]) & (x[..., 0] != high[0])]
+    assert abs(inside.mean() - 0.25) < 0.01 and inside.min() > -0.5 and inside.max() < 1.0
+
+
 def test_timers_are_exponential_with_a_mean_of_250_steps(env: LeggedRobot) -> None:
     torch.manual_seed(3)
     mask = torch.arange(N) < N // 2

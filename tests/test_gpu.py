@@ -81,6 +81,8 @@ ROUGH: dict[str, object] = {
     "terrain__border_size": 1.0,
     "termination__min_base_height": 0.1,
     "commands__curriculum": True,
+    "commands__end_probability": 0.2,
+    "rewards__tracking_sigma_growth": {"stairs_up": 0.1},
     "sim__njmax": 56,
 }
 

@@ -170,6 +170,8 @@ def test_shapes_and_their_probes() -> None:
         (kinds.mjGEOM_SPHERE, [0.1, 0, 0], 1),
         (kinds.mjGEOM_CAPSULE, [0.1, 0.2, 0], 5),
         (kinds.mjGEOM_CYLINDER, [0.1, 0.1, 0], 38),
+        (kinds.mjGEOM_CYLINDER, [0.02, 0.01, 0], 26),
+        (kinds.mjGEOM_CYLINDER, [0.02, 0.1, 0], 3),
         (kinds.mjGEOM_BOX, [0.1] * 3, 26),
         (kinds.mjGEOM_ELLIPSOID, [0.1, 0.1, 0.05], 62),
     ):
@@ -187,6 +189,12 @@ def test_shapes_and_their_probes() -> None:
         ModelError, match=r"^geom 'ball' is a hfield: its surface is not known as points, .* or take the engine mujoco$"
     ):
         probes(model, 0)
+
+
+def test_a_rod_is_a_row_of_spheres_as_long_and_as_thick_as_it_is() -> None:
+    _, places, radii = probes(ball_model(None, {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [0.013, 0.06, 0]}), 0)
+    np.testing.assert_allclose(places, [[0, 0, -0.047], [0, 0, 0.047]], atol=1e-9)
+    assert radii == [0.013, 0.013]
 
 
 def test_an_ellipsoid_is_probed_on_its_surface_and_at_its_ends() -> None:

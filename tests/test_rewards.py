@@ -238,6 +238,21 @@ def test_tracking_sigma_goes_to_its_end_over_a_training() -> None:
     )
 
 
+def test_tracking_sigma_is_wider_on_harder_levels_of_some_kinds() -> None:
+    """By a tenth a level on stairs, and not on flat ground; beside it the sigma of the training's progress."""
+    ground = {"terrain.mesh_type": "heightfield", "terrain.num_cols": 2, "terrain.num_rows": 6}
+    kinds = {"flat": 1.0, "stairs_up": 1.0}
+    wider = {"rewards.tracking_sigma_growth": {"stairs_up": 0.1, "waves": 1.0}, "rewards.tracking_sigma_end": 0.05}
+    env = make_env(2, {**HAND, **ground, "terrain.terrain_proportions": kinds, **wider})
+    assert env.tiles
+    env.tiles.put(torch.tensor([5, 5]))
+    squared = (env.commands[:, :2] - env.base_lin_vel[:, :2]).square().sum(dim=1)
+    for done, sigma in ((0.0, 0.25), (1.0, 0.05)):
+        env.on_training_progress(done)
+        sigmas = torch.tensor([sigma, 1.5 * sigma])
+        torch.testing.assert_close(env._reward_tracking_lin_vel(), torch.exp(-squared / sigmas))
+
+
 def test_reward_is_for_a_control_step_of_any_length() -> None:
     env = make_env(2, {**HAND, **TWO, "control.decimation": 10})
     paint(env)

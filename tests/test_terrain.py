@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from legged_mw.sim.height_map import HeightMap
 from legged_mw.sim.terrain import (
     KINDS,
     LEVEL,
-    MEASURES,
     PLATFORM,
     Grid,
     Heights,
@@ -101,6 +99,13 @@ def test_each_kind_is_as_high_and_wide_as_it_says() -> None:
     assert set(np.diff(edges)[1:-1]) == {2, 3}
 
 
+def test_beyond_1_every_kind_grows_on_and_still_fits_its_neighbours() -> None:
+    """Stairs of 25 cm at 1.41; at 2, the most, the smallest tile still has its middle and its rim."""
+    ground = terrain(levels=2, difficulty=(0.0, 1.41), proportions={"stairs_up": 1.0}, columns=1)
+    assert np.unique(np.diff(tile(ground, 1, "stairs_up")[40, 40:]).round(3)).tolist() == [0.0, 0.25]
+    terrain(levels=2, difficulty=(2.0, 2.0), proportions=dict.fromkeys(KINDS, 1.0), columns=len(KINDS), tile=4.0)
+
+
 def test_slopes_go_up_and_down_in_turn() -> None:
     """Along a column, and side by side: two columns of a kind have one of each at every level."""
     ground = terrain(proportions={"smooth_slope": 1.0, "rough_slope": 1.0}, columns=4)
@@ -177,17 +182,6 @@ def test_a_lookup_by_hand_at_the_rim_and_beyond() -> None:
 
 
 # ---- kinds of one's own
-
-
-@pytest.fixture
-def own_kinds() -> Iterator[None]:
-    """What a test adds is gone after it."""
-    tables = (KINDS, MEASURES, LEVEL)
-    before = [table.copy() for table in tables]
-    yield
-    for table, kept in zip(tables, before, strict=True):
-        table.clear()
-        table.update(kept)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("own_kinds")

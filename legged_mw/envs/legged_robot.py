@@ -165,16 +165,16 @@ class LeggedRobot(RobotTask):
     # ---- commands ---------------------------------------------------------------------------------------------------
 
     def _reset_commands(self, mask: Tensor) -> None:
-        """A new episode's command is uniform over the ranges."""
-        assign(self.commands, mask, self._uniform_commands())
+        """A new episode's command is drawn from the ranges, none at rest."""
+        assign(self.commands, mask, self._new_commands())
         assign(self.command_timer, mask, self._draw_timers())
         self._draw_heading(mask)
 
     def _resample_commands(self, mask: Tensor) -> None:
-        """Where a timer ended a command keeps its value, or gets its default (velocities 0) or a new uniform value."""
+        """Where a timer ended a command keeps its value, or gets its default (velocities 0) or a new value."""
         count = len(self.command_table)
         chance = torch.rand(self.num_envs, 2 * count, device=self.device)
-        fresh = torch.where(chance[:, :count] < self.keep_probability, self._uniform_commands(), self.rest_command)
+        fresh = torch.where(chance[:, :count] < self.keep_probability, self._new_commands(), self.rest_command)
         change = (chance[:, count:] < self.cfg.commands.change_probability) & mask[:, None]
         self.commands.copy_(torch.where(change, fresh, self.commands))
         assign(self.command_timer, mask, self._draw_timers())
@@ -194,9 +194,13 @@ class LeggedRobot(RobotTask):
         low, high = self.command_ranges[:, 2]
         self.commands[:, 2] = (self.cfg.commands.heading_gain * error).clamp(low, high)
 
-    def _uniform_commands(self) -> Tensor:
-        low, high = self.command_ranges
-        return torch.lerp(low, high, torch.rand_like(self.commands))
+    def _new_commands(self) -> Tensor:
+        """(N, C) Uniform over the ranges; at one of the ends with ``commands.end_probability``."""
+        (low, high), place = self.command_ranges, torch.rand_like(self.commands)
+        if self.cfg.commands.end_probability:
+            at_end = torch.rand_like(self.commands) < self.cfg.commands.end_probability
+            place = torch.where(at_end, place.round(), place)
+        return torch.lerp(low, high, place)
 
     def _draw_timers(self) -> Tensor:
         """Exponential, (N, 1), rounded to control steps."""
@@ -454,15 +458,24 @@ class LeggedRobot(RobotTask):
         """Move ``tracking_sigma`` towards ``rewards.tracking_sigma_end``; a ``share`` (0 to 1) of training is done."""
         super().on_training_progress(share)
         begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
-        if isinstance(self.tracking_sigma, Tensor):
-            self.tracking_sigma.fill_(begin + (end - begin) * share)
+        if isinstance(self._sigma, Tensor):
+            self._sigma.fill_(begin + (end - begin) * share)
+
+    @property
+    def tracking_sigma(self) -> Tensor | float:
+        """Of the tracking terms [m^2/s^2, rad^2/s^2]: a number, () if it changes, (N,) if it grows with the level."""
+        if self.sigma_growth is None or not self.tiles:
+            return self._sigma
+        return self._sigma * (1.0 + self.sigma_growth * self.tiles.levels)
 
     def _init_foot_rewards(self) -> None:
         """Allocate what the active terms need besides the state."""
         on, rewards = self._active_scales(), self.cfg.rewards
-        self.tracking_sigma: Tensor | float = rewards.tracking_sigma  # [m^2/s^2, rad^2/s^2]; a tensor () if it changes
+        self._sigma: Tensor | float = rewards.tracking_sigma  # a tensor () if it changes
         if rewards.tracking_sigma_end > 0.0:
-            self.tracking_sigma = self.remember(torch.tensor(rewards.tracking_sigma, device=self.device))
+            self._sigma = self.remember(torch.tensor(rewards.tracking_sigma, device=self.device))
+        # (N,) its growth a level, by each world's kind of ground
+        self.sigma_growth = self.tiles.of_kinds(rewards.tracking_sigma_growth) if self.tiles else None
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return
         stands = upright(self.robot, self.default_dof_pos.tolist(), self.foot_names)

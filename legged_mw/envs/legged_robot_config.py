@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.sim.terrain import KINDS
 from legged_mw.utils.bounds import (
     PAIR,
     SOME,
@@ -32,7 +33,7 @@ from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 
 Points = Annotated[list[Annotated[float, at_least(-100, 100, "m")]], SOME]
-ShareRange = Annotated[list[Share], PAIR]
+Difficulties = Annotated[list[Annotated[float, at_least(0, 2)]], PAIR]
 Swing = Annotated[float, above(0, 10, "m")]  # height of a foot in its swing
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
@@ -58,6 +59,9 @@ class LeggedRobotCfg(RobotTaskCfg):
         change_probability: Share = 0.5  # that a command changes at all when the timer ends [P]
         # for each command: that a changed one is not its default; 1 for those beyond the list [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]
+        end_probability: Share = (
+            0.0  # that a new value is one of its range's ends, not anywhere within [go2_rl_gym 0.2]
+        )
 
         curriculum: bool = False  # start with a share of the ranges, widen it while velocity is tracked well [L]
         curriculum_start: PositiveShare = 0.4  # that share [-] [ours]
@@ -89,6 +93,8 @@ class LeggedRobotCfg(RobotTaskCfg):
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
         tracking_sigma_end: NonNegative = 0.0  # its value at max_iterations, reached linearly; 0: it stays [ours]
+        # kind of ground -> growth of tracking_sigma from level to level, share of it [go2_rl_gym: with the speed, too]
+        tracking_sigma_growth: dict[str, NonNegative] = {}
         swing_height: Swing = 0.1  # target height of a swinging foot [m] [P]
         min_air_time: NonNegative = 0.1  # a shorter step is penalised [s] [P]
         min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
@@ -128,7 +134,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         tile_size: Positive = 8.0  # edge of a tile [m] [L]
         horizontal_scale: CellSize = 0.05  # between two heights [m] [ours: L 0.1 makes a stair a slope of 50 degrees]
         border_size: Border = 5.0  # flat ground around all tiles; past its middle an episode times out [m] [L 25]
-        difficulty: ShareRange = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
+        difficulty: Difficulties = [0.0, 1.0]  # of the first and the last row: 0 easy, 1 hard, 2 at most [L]
         # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
         terrain_proportions: dict[str, NonNegative] = {
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
@@ -173,6 +179,10 @@ class LeggedRobotCfg(RobotTaskCfg):
                 raise ConfigError(f"asset.foot_geoms: {unknown('foot', foot, feet, 'asset.foot_names')}")
             if not geoms:
                 raise ConfigError(f"asset.foot_geoms: foot '{foot}' has no geom; name the geoms that touch the ground")
+        for kind in self.rewards.tracking_sigma_growth:
+            if kind not in KINDS:
+                named = unknown("kind of terrain", kind, KINDS, "the table of kinds")
+                raise ConfigError(f"rewards.tracking_sigma_growth: {named}")
         if commands.curriculum and not self.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
             mend = "give rewards.scales.tracking_lin_vel a number above 0"
             raise ConfigError(f"commands.curriculum goes by how well tracking_lin_vel is met: {mend}")

@@ -7,6 +7,8 @@ the command: a robot that is commanded to turn on the spot owes no distance.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -73,6 +75,11 @@ class Tiles:
         anywhere = torch.randint_like(level, self.num_levels)
         level = torch.where(level >= self.num_levels, anywhere, level.clamp(min=0)) if self.curriculum else anywhere
         self.put(torch.where(mask, level, self.levels))
+
+    def of_kinds(self, table: Mapping[str, float]) -> Tensor | None:
+        """(N,) Each world's number in ``table``, by its kind of ground, else 0; None if the table is empty."""
+        numbers = [table.get(kind, 0.0) for kind in self.kinds]
+        return self._is_kind @ self._is_kind.new_tensor(numbers) if table else None
 
     def statistics(self) -> dict[str, Tensor]:
         """Mean level of all worlds and by kind of ground, each as a sum and a count (2,)."""

@@ -63,27 +63,30 @@ def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
             f"terrain.terrain_proportions: no kind of ground has a share above 0; there are: {', '.join(KINDS)}"
         )
     ground.terrain_proportions, ground.num_cols = dict.fromkeys(kinds, 1.0), len(kinds) * TILES
-    task.cfg.env.num_envs = ground.num_cols * LEVELS * repeats
+    task.cfg.env.num_envs = ground.num_cols * ground.num_rows * repeats
 
 
-def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
-    """Grade ``policy`` in the environment of a prepared task: the shares of crossings and falls by kind and level."""
+def run_crossing(env: LeggedRobot, policy: Policy, speed: float = SPEED) -> dict[str, Any]:
+    """Grade ``policy`` in the environment of a prepared task: the shares of crossings and falls by kind and level.
+
+    The command is ``speed`` ahead [m/s]; backwards below 0.
+    """
     assert env.tiles
-    kinds = env.tiles.kinds
-    repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds are sorted by kind, column, level
+    kinds, levels = env.tiles.kinds, env.tiles.num_levels
+    repeats = env.num_envs // (len(kinds) * TILES * levels)  # worlds are sorted by kind, column, level
     with rollout.keep_random_state(env.device):
         torch.manual_seed(0)
-        env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
-        outcomes = _walk(env, policy, env.tiles.size / 2)
-    by_tile = [worlds.view(len(kinds), TILES, LEVELS, repeats).double() for worlds in outcomes]
+        env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % levels})
+        outcomes = _walk(env, policy, env.tiles.size / 2, speed)
+    by_tile = [worlds.view(len(kinds), TILES, levels, repeats).double() for worlds in outcomes]
     crossed, fell = (worlds.mean(dim=(1, 3)).cpu().numpy().round(3).tolist() for worlds in by_tile)
     shares = {kind: {**_measure(kind), "crossed": crossed[i], "fell": fell[i]} for i, kind in enumerate(kinds)}
-    return {"speed": SPEED, "seconds": SECONDS, "robots": TILES * repeats, "kinds": shares}
+    return {"speed": speed, "seconds": SECONDS, "robots": TILES * repeats, "kinds": shares}
 
 
-def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
+def _walk(env: LeggedRobot, policy: Policy, edge: float, speed: float) -> tuple[Tensor, Tensor]:
     """Two masks (N,): worlds that moved ``edge`` [m] from the middle in x or y, and worlds that fell before."""
-    command = torch.tensor([SPEED, 0.0, 0.0, *(other.default for other in env.command_table[3:])], device=env.device)
+    command = torch.tensor([speed, 0.0, 0.0, *(other.default for other in env.command_table[3:])], device=env.device)
     crossed, fell, done = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
     env.commands.copy_(command)
     obs = env.first_observations()

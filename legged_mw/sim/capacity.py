@@ -62,12 +62,12 @@ def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
 
 
 def _contacts(model: mujoco.MjModel, geom: int, terrain: bool) -> int:
-    """The most contacts of ``geom`` with the ground. On terrain: two of a sphere, else one a probe of one side."""
+    """The most contacts of ``geom`` with the ground. On terrain: two of a sphere, one a probe of a row or of one side."""
     kind = _TYPE(model.geom_type[geom])
     plane = _ON_PLANE.get(kind, 4)
     if not terrain:
         return plane
     if kind == _TYPE.mjGEOM_SPHERE:
         return 2
-    probes = len(spheres_on(model, geom, PROBE_SPACING)[0])
-    return max(plane, probes + 1 if kind == _TYPE.mjGEOM_CAPSULE else probes // 2)
+    probes, radius = spheres_on(model, geom, PROBE_SPACING)
+    return max(plane, len(probes) + 1 if radius else len(probes) // 2)

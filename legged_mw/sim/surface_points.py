@@ -23,7 +23,8 @@ _KINDS = mujoco.mjtGeom
 def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points, float]:
     """Centres of spheres on the surface of ``geom``, at most about ``spacing`` [m] apart, and their radius [m].
 
-    A sphere is one sphere, a capsule a row of spheres, other shapes are points. Raises ModelError for unknown shapes.
+    A sphere is one sphere, a capsule or a thin rod a row of spheres, other shapes are points. Raises ModelError for
+    unknown shapes.
     """
     kind, size = _KINDS(model.geom_type[geom]), model.geom_size[geom]
     if kind == _KINDS.mjGEOM_MESH:
@@ -36,6 +37,8 @@ def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points
         )
         raise ModelError(f"{text}. Give the MJCF one of those there, or take the engine mujoco")
     radius = float(size[0]) if kind in (_KINDS.mjGEOM_SPHERE, _KINDS.mjGEOM_CAPSULE) else 0.0
+    if kind == _KINDS.mjGEOM_CYLINDER and 4.0 * size[0] <= spacing and size[0] <= size[1]:
+        return np.array([(0.0, 0.0, z) for z in _spaced(size[1] - size[0], spacing)]), float(size[0])  # a rod
     return np.array(_POINTS[kind](size, spacing), dtype=float).reshape(-1, 3), radius
 
 

@@ -36,7 +36,7 @@ class Terrain:
     corner: tuple[float, float]  # x, y of the vertex (0, 0) [m, world]
     tile: float  # [m] edge of a tile
     kinds: tuple[str, ...]  # of each column of tiles
-    difficulties: tuple[float, ...]  # of each level, 0 to 1
+    difficulties: tuple[float, ...]  # of each level
     origins: NDArray[np.float64]  # (levels, kinds, 3) the middle of each tile, on the ground [m, world]
 
     @property
@@ -170,7 +170,7 @@ class Grid:
         return heights * inside * outside
 
 
-# function of the grid, the difficulty from 0 to 1, and the random generator
+# function of the grid, the difficulty (0 easy, 1 hard, 2 at most) and the random generator
 Kind = Callable[[Grid, float, np.random.Generator], Heights]
 
 KINDS: dict[str, Kind] = {}
@@ -280,7 +280,7 @@ def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> 
 @add_kind("width [cm]", 100 * DITCH[0], 100 * DITCH[1], level=True)
 def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """A ditch around the middle, 5 to 60 cm wide, 0.5 m deep [legged_gym; ours: less wide]."""
-    width = max(_between(DITCH, difficulty), grid.cell)
+    width = min(max(_between(DITCH, difficulty), grid.cell), grid.half - PLATFORM - grid.cell)
     heights = grid.zeros()
     heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
     return heights

@@ -101,6 +101,7 @@ LEARNERS: dict[str, dict[str, Any]] = {
     "symmetry.mirror_loss_coeff": {"symmetry.mirror_loss_coeff": 0.0, "symmetry.use_mirror_loss": True},
     "distillation.gradient_length": {"distillation.teacher": "go1_flat", "distillation.gradient_length": 15},
     "commands.keep_probability": {"commands.keep_probability": [0.9, 0.25, 0.5, 0.5]},
+    "rewards.tracking_sigma_growth": {"rewards.tracking_sigma_growth": {"stairs": 0.1}},
     "asset.foot_names": {"asset.foot_names": ["F*"]},
 }
 
