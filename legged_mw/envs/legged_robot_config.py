@@ -59,9 +59,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         change_probability: Share = 0.5  # that a command changes at all when the timer ends [P]
         # for each command: that a changed one is not its default; 1 for those beyond the list [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]
-        end_probability: Share = (
-            0.0  # that a new value is one of its range's ends, not anywhere within [go2_rl_gym 0.2]
-        )
+        end_probability: Share = 0.0  # that a new value is one of the ends of its range [go2_rl_gym 0.2]
 
         curriculum: bool = False  # start with a share of the ranges, widen it while velocity is tracked well [L]
         curriculum_start: PositiveShare = 0.4  # that share [-] [ours]
@@ -93,7 +91,7 @@ class LeggedRobotCfg(RobotTaskCfg):
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
         tracking_sigma_end: NonNegative = 0.0  # its value at max_iterations, reached linearly; 0: it stays [ours]
-        # kind of ground -> growth of tracking_sigma from level to level, share of it [go2_rl_gym: with the speed, too]
+        # kind of ground -> share of tracking_sigma that each level adds [go2_rl_gym: with the speed, too]
         tracking_sigma_growth: dict[str, NonNegative] = {}
         swing_height: Swing = 0.1  # target height of a swinging foot [m] [P]
         min_air_time: NonNegative = 0.1  # a shorter step is penalised [s] [P]
