@@ -30,7 +30,7 @@ from tests.wires import POLICIES
 
 GO2 = POLICIES / "go2_flat"
 CONTRACT = read_contract(GO2)
-CALF = "FL_calf_joint"
+CALF, OTHER = "FL_calf_joint", "FR_calf_joint"
 JOINT = CONTRACT.joints.index(CALF)
 SWEEP = 3.0  # [s]
 EVEN = np.ones(12)
@@ -72,27 +72,28 @@ class Lockstep:
         return ""
 
 
-class OneSweep(Chirp):
-    """The sweep of one joint, at once."""
+class OneSlot(Chirp):
+    """The sweeps of one slot: one joint of each leg."""
 
     def _check(self, measured: Measurement) -> Moves:
         self.state = CHIRP
         for _ in range(100):
-            yield self._held(self._pose)
-        yield from self._sweep(JOINT)
+            yield self._held(self.plan.pose)
+        (slot,) = (slot for slot in self.plan.slots if JOINT in slot)
+        assert {CONTRACT.joints[joint] for joint in slot} == {CALF, OTHER, "RL_calf_joint", "RR_calf_joint"}
+        yield from self._sweep(slot)
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The log of a sweep of SWEEP s; a sweep has that length in all tests here."""
+    """The log of one slot, of SWEEP s."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (chirp, fit):
-            patch.setattr(module, "SECONDS", len(CONTRACT.joints) * (SWEEP + 2 * chirp.REST))
+        patch.setattr(chirp, "SECONDS", 3 * (SWEEP + 2 * chirp.REST))  # of three slots
         wire = Lockstep()
         robot = UnitreeRobot(CONTRACT, wire, wire.receive(), simulated=True, clock=lambda: wire.sim.time)
         contract, limits = at_rate(CONTRACT, Limits.of(GO2, CONTRACT, robot.limits), robot)
         controller, path = Controller(GO2, contract), tmp_path_factory.mktemp("fit") / "one.lmwlog"
-        states = OneSweep(controller, [Script({1: "start"})], lambda _: None, robot, limits)
+        states = OneSlot(controller, [Script({1: "start"})], lambda _: None, robot, limits)
         safety, written = Safety(contract, limits), Log(path, contract, GO2, "simulated")
         done = run(robot, controller, lambda _: np.zeros(0), 9.0, live=False, safety=safety, states=states, log=written)
         assert not done.trips and states.over
@@ -100,19 +101,21 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_the_numbers_of_a_changed_robot_are_found(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Armature, friction, damping and gain within 10 %, the delay within 2 ms of its 6 and the wire's 2."""
-    monkeypatch.setattr(fit, "TRIES", 32)
-    found = fit.fit_log(log, [CALF])
-    (calf,) = found.joints
-    true = CHANGE.table()[JOINT]
-    assert calf.joint == JOINT and calf.after < 0.0015 < 0.02 < calf.before
-    assert np.abs(calf.values / true - 1.0)[fit.ARMATURE : fit.OFFSET].max() < 0.1
-    assert abs(calf.values[fit.DELAY] - 8.0) < 2.0
-    assert (calf.deviation < 0.1 * np.maximum(true, 0.1)).all()
+    """Armature, friction, damping and gain within 10 %, the delay within 2 ms of its 6 and the wire's 2, of two limbs."""
+    monkeypatch.setattr(fit, "TRIES", 16)
+    found = fit.fit_log(log, [CALF, OTHER])
+    for calf in found.joints:
+        true = CHANGE.table()[calf.joint]
+        assert calf.after < 0.0015 < 0.02 < calf.before
+        assert np.abs(calf.values / true - 1.0)[fit.ARMATURE : fit.OFFSET].max() < 0.1
+        assert abs(calf.values[fit.DELAY] - 8.0) < 2.0
+        assert (calf.deviation < 0.1 * np.maximum(true, 0.1)).all()
+    assert {CONTRACT.joints[calf.joint] for calf in found.joints} == {CALF, OTHER}
     assert CALF in fit.table(found)
     fields, task = fit.overrides(found), load_task("go2_flat")
     task.update(fields, where="the fit")
-    assert task.cfg.asset.armature[CALF] == pytest.approx(0.052, rel=0.1)
+    (armature,) = {*task.cfg.asset.armature.values()}
+    assert armature == pytest.approx(0.052, rel=0.1)
     assert task.cfg.domain_rand.stiffness[0] < 0.92 and task.cfg.domain_rand.delay_ms[0] > 5.0
     fit.draw(found, log.with_suffix(".png"))
     assert log.with_suffix(".png").stat().st_size > 10_000
@@ -137,7 +140,7 @@ def kept(rows: Callable[[int], slice]) -> Callable[[DriveLog], DriveLog]:
         (changed("joint_pos", lambda q: own(q, q[0, JOINT])), "its encoder is dead"),
         (changed("joint_pos", lambda q: own(q, q[:, JOINT] + 0.3 * (np.arange(len(q)) > 900))), "encoder jumps by 0.3"),
         (changed("joint_pos", lambda q: own(q, -1.5 + 0.05 * (q[:, JOINT] + 1.5))), "its motor is loose"),
-        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint does, joint 3 of 12"),
+        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint does"),
         (kept(lambda count: slice(0, count, 10)), "has a measurement each 20 ms"),
         (changed("state", lambda state: 0.0 * state), "holds no chirp"),
         (changed("joint_pos", lambda q: q[:, :10]), "is of a robot with 10 joints"),
@@ -156,6 +159,19 @@ def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
     with pytest.raises(LogError, match=r"FL_calf_joint cannot be fitted: the best numbers explain 74.1%"):
         fit._check_explained(Path("log"), CALF, joint)
     fit._check_explained(Path("log"), CALF, joint._replace(after=0.05))
+
+
+@pytest.mark.parametrize(("name", "slots"), [("go2_flat", 3), ("g1_flat", 10)])
+def test_limbs_that_sweep_together_are_apart(name: str, slots: int) -> None:
+    folder = POLICIES / name
+    contract = read_contract(folder)
+    plan = chirp.plan(contract, read_scene(folder, contract), Limits.of(folder, contract))
+    assert sorted(joint for slot in plan.slots for joint in slot) == list(range(len(contract.joints)))
+    assert len(plan.slots) == slots
+    for slot in plan.slots:
+        names = [contract.joints[joint] for joint in slot]
+        assert sum(joint.startswith("waist") for joint in names) < 2
+        assert len({joint.split("_")[0] for joint in names if "_hip_" in joint or "_knee_" in joint}) == sum("_hip_" in joint or "_knee_" in joint for joint in names)
 
 
 def test_sweeps_keep_the_contracts_limits() -> None:

@@ -1,6 +1,7 @@
-"""The chirp: after the joint check each joint of a hanging robot follows a sine of rising frequency, the others are held.
+"""The chirp: after the joint check the joints of a hanging robot follow sines of rising frequency, one of each limb at a time.
 
-Its log is what ``legged-mw fit`` reads: joint after joint, every measurement that the robot sends.
+Its log is what ``legged-mw fit`` reads: slot after slot, every measurement that the robot sends. The joints of a slot
+are of different limbs, which meet neither each other nor the body, and reach each other through the root alone.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
+from itertools import chain, product
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -18,15 +21,17 @@ from legged_mw.deploy.inputs import InputSource
 from legged_mw.deploy.joint_check import JointCheck, Moves
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits
-from legged_mw.deploy.simulated import DeployScene
+from legged_mw.deploy.simulated import SHAPES, DeployScene
 from legged_mw.deploy.states import CHIRP, Order
 
 SECONDS = 58.0  # [s] ours: of all sweeps together
-MOVE, SETTLE, REST = 2.0, 1.0, 0.2  # [s] ours: to the default pose; there; before and after each sweep
+MOVE, SETTLE, REST = 2.0, 1.0, 0.2  # [s] ours: to the pose; there; before and after each sweep
 FADE = 0.3  # [s] ours: in which a sweep's amplitude rises, and falls
 AMPLITUDE, FASTEST = 0.4, 4.0  # [rad], [rad/s] ours: of a target, at most
 TORQUE, ROOM, SPEED = 0.4, 0.8, 0.3  # [share] of the motor's torque, of the way to the range's end, of the top speed
 SLOWEST, RANGE, ABOVE = 0.5, (3.0, 15.0), 3.0  # [Hz] begin and limits of the end; end by the servo's own frequency
+CLEAR = 0.02  # [m] ours: between two limbs, at least
+ASIDE, FARTHEST, PASSES = 0.05, 12, 3  # [rad] ours: step of a joint aside; [-] steps at most; passes over the joints
 
 
 def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract, Limits]:
@@ -44,6 +49,20 @@ def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract,
     return replace(contract, period=robot.step, decimation=1), limits.but(counted, "--chirp")
 
 
+class Plan(NamedTuple):
+    """What a chirp moves, and how far."""
+
+    pose: Floats  # (D,) [rad] of which the sweeps are about
+    amplitude: Floats  # (D,) [rad]
+    highest: Floats  # (D,) [Hz]
+    slots: list[list[int]]  # joints that sweep at the same time
+
+    @property
+    def seconds(self) -> float:
+        """[s] of a sweep."""
+        return SECONDS / len(self.slots) - 2 * REST
+
+
 class Chirp(JointCheck):
     """The joint check of one robot; if all joints are right, their sweeps."""
 
@@ -58,8 +77,7 @@ class Chirp(JointCheck):
         """Raises RobotError if the robot cannot move softly."""
         super().__init__(controller, sources, say, robot, limits)
         self._now, self._swept = 0.0, 0
-        self._pose = controller.contract.default_pose
-        self.amplitude, self.highest = _extent(controller.contract, self._scene, limits)  # (D,) [rad], [Hz]
+        self.plan = plan(controller.contract, self._scene, limits)
         ratings = controller.contract.ratings
         top = SPEED * ratings.top_speed if ratings else np.full(len(self.joints), np.nan)
         self._speed = np.fmin(FASTEST, top)  # (D,) [rad/s] of a target
@@ -80,33 +98,34 @@ class Chirp(JointCheck):
     def _check(self, measured: Measurement) -> Moves:
         yield from super()._check(measured)
         if super().right:
-            self._enter(CHIRP, self._now, "each joint follows a sine of rising frequency")
+            self._enter(CHIRP, self._now, "the joints follow sines of rising frequency, one of each limb at a time")
             yield from self._chirp(measured)
 
     def _chirp(self, begun: Measurement) -> Moves:
-        """From where the joint check held the joints, as ``begun``, to the default pose, and all sweeps."""
+        """From where the joint check held the joints, as ``begun``, to the plan's pose, and all sweeps."""
         begin = np.clip(begun.joint_pos, self._limits.lowest, self._limits.highest)
         count, settle = (round(seconds / self.controller.contract.period) for seconds in (MOVE, SETTLE))
         for step in range(count + settle):
-            yield self._held(begin + min(1.0, (step + 1) / count) * (self._pose - begin))
-        for joint in range(len(self.joints)):
-            yield from self._sweep(joint)
-            self._swept += 1
+            yield self._held(begin + min(1.0, (step + 1) / count) * (self.plan.pose - begin))
+        for slot in self.plan.slots:
+            yield from self._sweep(slot)
+            self._swept += len(slot)
 
-    def _sweep(self, joint: int) -> Generator[Order, Measurement, None]:
-        for target in self.targets(joint):
-            pose = self._pose.copy()
-            pose[joint] += target
+    def _sweep(self, slot: Sequence[int]) -> Generator[Order, Measurement, None]:
+        self._tell(f"{', '.join(self.joints[joint] for joint in slot)} sweep")
+        for targets in np.stack([self.targets(joint) for joint in slot], axis=1):
+            pose = self.plan.pose.copy()
+            pose[slot] += targets
             yield self._held(pose)
 
     def targets(self, joint: int) -> Floats:
         """Targets (T,) [rad] of a joint's sweep about its pose."""
         period = self.controller.contract.period
-        rest, seconds = round(REST / period), SECONDS / len(self.joints) - 2 * REST
+        rest, seconds = round(REST / period), self.plan.seconds
         time = period * np.arange(round(seconds / period))
-        rate = math.log(self.highest[joint] / SLOWEST) / seconds
+        rate = math.log(self.plan.highest[joint] / SLOWEST) / seconds
         frequency = 2.0 * math.pi * SLOWEST * np.exp(rate * time)  # [rad/s]
-        size = np.minimum(self.amplitude[joint], self._speed[joint] / frequency)
+        size = np.minimum(self.plan.amplitude[joint], self._speed[joint] / frequency)
         fade = np.clip(np.minimum(time, time[-1] - time) / FADE, 0.0, 1.0)
         return np.pad(fade * size * np.sin((frequency - frequency[0]) / rate), (rest, rest))
 
@@ -115,16 +134,105 @@ class Chirp(JointCheck):
         return Order(CHIRP, targets, contract.stiffness, contract.damping)
 
 
-def _extent(contract: Contract, scene: DeployScene, limits: Limits) -> tuple[Floats, Floats]:
-    """Amplitude (D,) [rad] and highest frequency (D,) [Hz] of each joint's sweep, by the contract's limits."""
+# ---- the plan
+
+
+def plan(contract: Contract, scene: DeployScene, limits: Limits) -> Plan:
+    """Sweeps within the contract's limits, in which no limb meets another one or the body."""
     data, inertia = mujoco.MjData(scene.model), np.zeros((scene.model.nv, scene.model.nv))
     mujoco.mj_resetDataKeyframe(scene.model, data, 0)
     mujoco.mj_forward(scene.model, data)
     mujoco.mj_fullM(scene.model, data, inertia)
     own = np.sqrt(contract.stiffness / np.diag(inertia)[scene.dofs]) / (2.0 * math.pi)
-    pose = contract.default_pose
-    room = ROOM * np.minimum(
-        pose - np.maximum(limits.low, limits.lowest), np.minimum(limits.high, limits.highest) - pose
-    )
-    amplitude = np.minimum(AMPLITUDE, np.minimum(TORQUE * limits.motor / contract.stiffness, np.maximum(room, 0.0)))
-    return amplitude, np.clip(ABOVE * own, *RANGE)
+    highest = np.clip(ABOVE * own, *RANGE)
+    low, high = np.maximum(limits.low, limits.lowest), np.minimum(limits.high, limits.highest)
+    pose, most = contract.default_pose, np.minimum(AMPLITUDE, TORQUE * limits.motor / contract.stiffness)
+    amplitude = np.minimum(most, np.maximum(ROOM * np.minimum(pose - low, high - pose), 0.0))
+    limbs = _limbs(scene.model, contract.joints)
+    touches = _touches(scene, contract.joints, limbs)
+    pose = _clear_pose(pose, amplitude, low + amplitude / ROOM, high - amplitude / ROOM, touches)
+    limb = [limbs[int(scene.model.joint(name).bodyid[0])] for name in contract.joints]
+    return Plan(pose, amplitude, highest, _slots(limb, pose, amplitude, touches))
+
+
+def _limbs(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, int]:
+    """The limb of each body: 0 for the root, then one for each chain of joints up to where it branches."""
+    moved = {int(model.joint(name).bodyid[0]) for name in joints}
+    carrier, limbs = dict[int, int](), dict[int, int]()
+    for body in range(1, model.nbody):  # parents come first
+        above = int(model.body_parentid[body])
+        carrier[body] = above if above in moved or above not in carrier else carrier[above]
+    carriers = [carrier[body] for body in moved]
+    for body in range(1, model.nbody):
+        above = limbs.get(int(model.body_parentid[body]), 0)
+        begins = body in moved and (not above or carriers.count(carrier[body]) > 1)
+        limbs[body] = max(limbs.values()) + 1 if begins else above
+    return limbs
+
+
+Touches = Callable[[Floats], int]
+
+
+def _touches(scene: DeployScene, joints: Sequence[str], limbs: dict[int, int]) -> Touches:
+    """A function that counts the shapes of different limbs that are nearer than CLEAR in a pose (D,)."""
+    spec = scene.spec.copy()
+    for body in spec.bodies[1:]:
+        limb = 1 << limbs[scene.model.body(body.name).id]
+        for geom in body.geoms:
+            own = geom.group == SHAPES and limb > 1
+            geom.contype, geom.conaffinity = (limb, ~limb & 0x3FFFFFFF) if own else (0, 0)
+            geom.margin = CLEAR
+    for geom in spec.worldbody.geoms:
+        geom.contype = geom.conaffinity = 0
+    model = spec.compile()
+    data, places = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in joints]
+
+    def touches(pose: Floats) -> int:
+        data.qpos[places] = pose
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        return data.ncon
+
+    return touches
+
+
+def _ends(pose: Floats, amplitude: Floats, joints: Sequence[int]) -> list[Floats]:
+    """The poses in which each of ``joints`` is at an end of its sweep."""
+    poses = []
+    for signs in product((-1.0, 1.0), repeat=len(joints)):
+        poses.append(pose.copy())
+        poses[-1][joints] += signs * amplitude[joints]
+    return poses
+
+
+def _clear_pose(pose: Floats, amplitude: Floats, low: Floats, high: Floats, touches: Touches) -> Floats:
+    """A pose near ``pose`` from which each joint can sweep alone, if there is one."""
+    default, pose = pose, pose.copy()
+    asides = sorted(ASIDE * np.arange(-FARTHEST, FARTHEST + 1), key=abs)
+    for _ in range(PASSES):
+        for joint in reversed(range(len(pose))):  # of a limb, those that carry less first
+            inside = [default[joint]] + [
+                angle for angle in default[joint] + asides if low[joint] <= angle <= high[joint]
+            ]
+            met = list[int]()
+            for pose[joint] in inside:
+                met.append(sum(map(touches, _ends(pose, amplitude, [joint]))))
+                if not met[-1]:
+                    break
+            pose[joint] = inside[met.index(min(met))]
+    return pose
+
+
+def _slots(limb: Sequence[int], pose: Floats, amplitude: Floats, touches: Touches) -> list[list[int]]:
+    """Each joint in the first slot of other limbs' joints that it cannot meet."""
+    slots = list[list[int]]()
+    for joint in range(len(pose)):
+        for slot in slots:
+            pairs = [_ends(pose, amplitude, [joint, other]) for other in slot]
+            if limb[joint] not in [limb[other] for other in slot] and not any(map(touches, chain(*pairs))):
+                slot.append(joint)
+                break
+        else:
+            slots.append([joint])
+    return slots

@@ -21,7 +21,7 @@ import numpy as np
 from mujoco import minimize
 from mujoco.rollout import Rollout
 
-from legged_mw.deploy.chirp import REST, SECONDS, SLOWEST
+from legged_mw.deploy.chirp import REST, SLOWEST
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.log import DriveLog, LogError, read_log
 from legged_mw.deploy.robot import Floats
@@ -42,7 +42,6 @@ BLOCK = 50  # ours: measurements in a row whose errors may be alike
 NOISE = 1.5  # ours: a residual so small is noise, and no other start is followed
 STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: of the optimiser, in the scale of each number
 SLOW = 0.005  # [s] ours: a log of slower measurements shows neither delay nor armature
-SHORT = 0.9  # [share] ours: of a sweep; a shorter one is cut off
 MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.99  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
 
 
@@ -74,7 +73,7 @@ class Sweep(NamedTuple):
     """One joint's part of a log, at even times."""
 
     joint: int
-    rest: int  # measurements at rest, at the begin
+    begin: Floats  # (D,) [rad] at the begin
     time: Floats  # (T,) [s] of measurements
     angle: Floats  # (T, D) [rad]
     speed: Floats  # (T, D) [rad/s]
@@ -161,16 +160,16 @@ def read_sweeps(
         raise LogError(
             f"{shown(path)} has a measurement each {1e3 * step:.0f} ms; a fit needs one each {1e3 * SLOW:.0f} ms, as --chirp logs"
         )
-    moved = np.abs(rows["target"] - contract.default_pose) > 1e-5
-    still = np.flatnonzero(~moved.any(axis=1))
-    moved[: still[0] if len(still) else len(moved)] = False  # on the way to the pose
-    spans = {name: np.flatnonzero(moved[:, contract.joints.index(name)]) for name in joints}
-    whole = SECONDS / len(contract.joints) - 2 * REST  # [s]
-    sweeps, rest = list[Sweep](), round(REST / step)
-    for name, span in spans.items():
-        if len(span) < 2 or rows["time"][span[-1], 0] - rows["time"][span[0], 0] < SHORT * whole:
-            place = f"joint {contract.joints.index(name) + 1} of {len(contract.joints)}"
-            raise LogError(f"{shown(path)} ends before the sweep of {name} does, {place}: record the chirp again")
+    targets, rest = rows["target"], round(REST / step)
+    still = np.flatnonzero((np.diff(targets, axis=0) == 0.0).all(axis=1))
+    begin = int(still[0]) if len(still) else len(targets) - 1  # the pose, of which the sweeps are about
+    moved = np.abs(targets - targets[begin]) > 1e-5
+    moved[:begin] = False
+    sweeps = list[Sweep]()
+    for name in joints:
+        span = np.flatnonzero(moved[:, contract.joints.index(name)])
+        if len(span) < 2 or span[-1] + rest // 2 > len(moved):
+            raise LogError(f"{shown(path)} ends before the sweep of {name} does: record the chirp again")
         part = {key: values[max(0, span[0] - rest) : span[-1] + rest] for key, values in rows.items()}
         _check_joint(path, name, contract.joints.index(name), part, step)
         sweeps.append(_sweep(contract.joints.index(name), part, contract, model, step))
@@ -215,16 +214,23 @@ def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoc
         np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
     )
     root, turn = _root_motion(contract, model, _even(gyro), felt, step)
-    slope = np.concatenate([root, np.gradient(_even(speed), step, axis=0)], axis=1)
+    slope = np.concatenate([root, _change(_even(speed)) / step], axis=1)
     spin = np.concatenate([np.zeros(3), turn, _even(speed)[0]])
+    way, rest = step * np.cumsum(_even(speed), axis=0), round(REST / step)
+    begin = (angle - way + way[0])[:rest].mean(axis=0)
     target = rows["target"][:, joint]
-    return Sweep(joint, round(REST / step), times - times[0], angle, speed, slope, spin, sent - times[0], target)
+    return Sweep(joint, begin, times - times[0], angle, speed, slope, spin, sent - times[0], target)
 
 
 def _even(values: Floats) -> Floats:
     """Means over SMOOTH rows of (T, K)."""
     padded, window = np.pad(values, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
     return np.stack([np.convolve(column, window, "valid") for column in padded.T], axis=1)
+
+
+def _change(values: Floats) -> Floats:
+    """Of each row to the next one (T, K); the last row's is 0."""
+    return np.diff(values, axis=0, append=values[-1:])
 
 
 def _root_motion(
@@ -240,13 +246,14 @@ def _root_motion(
     mujoco.mj_kinematics(model, data)
     place, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
     omega = gyro @ turn.T
-    turning = np.gradient(omega, step, axis=0)
+    turning = _change(omega) / step
+    felt = np.append(felt[1:], felt[-1:], axis=0)  # an IMU says what it felt since the measurement before
     own = felt @ turn.T - np.cross(turning, place) - np.cross(omega, np.cross(omega, place))
     quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(own)
-    for i in range(len(own)):
+    for i, after in enumerate(np.append(omega[1:], omega[-1:], axis=0)):
         mujoco.mju_quat2Mat(rotation, quaternion)
         world[i] = rotation.reshape(3, 3) @ own[i]
-        mujoco.mju_quatIntegrate(quaternion, omega[i], step)
+        mujoco.mju_quatIntegrate(quaternion, after, step)
     return np.concatenate([world, turning], axis=1), omega[0]
 
 
@@ -267,8 +274,10 @@ class Chain:
         self._dof, self._angle = int(joint.dofadr[0]), int(joint.qposadr[0])
         own = [0.0, model.dof_armature[self._dof], model.dof_frictionloss[self._dof], 0.0, 1.0, 0.0]
         self.nominal: Floats = np.array(own)  # (6,) the scene's
+        self._mobility = float(model.dof_invweight0[self._dof])  # [1 / (kg m^2)]
         model.opt.timestep, model.opt.integrator = sweep.time[1], mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.iterations, model.opt.ls_iterations, model.opt.gravity[:] = 100, 50, 0.0
+        model.opt.tolerance = 1e-12
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = HEAVY, 0.0, 0.0
         model.actuator_ctrllimited[:], model.actuator_biastype[:] = 0, mujoco.mjtBias.mjBIAS_AFFINE
@@ -286,10 +295,8 @@ class Chain:
         start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         start[:, 4], qvel = 1.0, 1 + model.nq  # after the time: place, attitude, angles, speeds
         start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[told]
-        start[:, 1 + self._angles] = sweep.angle[: sweep.rest, self._all].mean(axis=0)
-        speed = sweep.speed[: sweep.rest, sweep.joint].mean()
-        start[:, qvel + self._dof] = speed
-        start[:, 1 + self._angle] -= speed * sweep.time[: sweep.rest].mean() + values[:, OFFSET]
+        start[:, 1 + self._angles] = sweep.begin[self._all]
+        start[:, 1 + self._angle] -= values[:, OFFSET]
         for k, numbers in enumerate(values):
             targets = np.interp(sweep.time - numbers[DELAY] / 1000.0, sweep.sent, sweep.target)
             control[k, :, self._actuator] = targets - numbers[OFFSET]
@@ -304,6 +311,9 @@ class Chain:
         model, (stiffness, damping) = copy.copy(self.model), numbers[GAIN] * self._gains
         model.dof_armature[self._dof], model.dof_frictionloss[self._dof] = numbers[ARMATURE], numbers[FRICTION]
         model.dof_damping[self._dof] = numbers[DAMPING]
+        # MuJoCo's friction is as soft as the joint's inverse inertia, which the armature changes
+        gained = numbers[ARMATURE] - self.nominal[ARMATURE]
+        model.dof_invweight0[self._dof] = self._mobility / (1.0 + self._mobility * gained)
         model.actuator_gainprm[self._actuator, 0] = stiffness
         model.actuator_biasprm[self._actuator, 1:3] = -stiffness, -damping
         return model

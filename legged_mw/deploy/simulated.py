@@ -83,7 +83,7 @@ Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # recompute the sensors of position and velocity in the new state
 
 _GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan detects; the robot's geoms are in other groups
-_SHAPES = 3  # geom group of a robot's collision shapes
+SHAPES = 3  # geom group of a robot's collision shapes
 _DEEP, _FAR = 0.1, 1e4  # [m] limits of a start pose: depth below the ground, distance from the origin
 _ABOVE = 2.0  # [m] height above the root at which the scan's rays begin
 
@@ -439,7 +439,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     try:
         spec = XmlSource(folder / file, alone=True).spec()
         for body in spec.bodies[1:] if whole else ():
-            shapes = [geom for geom in body.geoms if geom.group == _SHAPES]
+            shapes = [geom for geom in body.geoms if geom.group == SHAPES]
             for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():
                 geom.conaffinity = 1
         model = spec.compile()
