@@ -171,9 +171,7 @@ def test_limbs_that_sweep_together_are_apart(name: str, slots: int) -> None:
     for slot in plan.slots:
         names = [contract.joints[joint] for joint in slot]
         assert sum(joint.startswith("waist") for joint in names) < 2
-        assert len({joint.split("_")[0] for joint in names if "_hip_" in joint or "_knee_" in joint}) == sum(
-            "_hip_" in joint or "_knee_" in joint for joint in names
-        )
+        assert len({joint.split("_")[0] for joint in names if "_hip_" in joint or "_knee_" in joint}) == sum("_hip_" in joint or "_knee_" in joint for joint in names)
 
 
 def test_sweeps_keep_the_contracts_limits() -> None:

@@ -152,7 +152,7 @@ def plan(contract: Contract, scene: DeployScene, limits: Limits) -> Plan:
     touches = _touches(scene, contract.joints, limbs)
     pose = _clear_pose(pose, amplitude, low + amplitude / ROOM, high - amplitude / ROOM, touches)
     limb = [limbs[int(scene.model.joint(name).bodyid[0])] for name in contract.joints]
-    return Plan(pose, amplitude, highest, _slots(limb, _carrying(scene.model, limbs), pose, amplitude, touches))
+    return Plan(pose, amplitude, highest, _slots(limb, pose, amplitude, touches))
 
 
 def _limbs(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, int]:
@@ -168,12 +168,6 @@ def _limbs(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, int]:
         begins = body in moved and (not above or carriers.count(carrier[body]) > 1)
         limbs[body] = max(limbs.values()) + 1 if begins else above
     return limbs
-
-
-def _carrying(model: mujoco.MjModel, limbs: dict[int, int]) -> set[int]:
-    """The limbs that other limbs hang on, as arms do on a waist."""
-    pairs = [(limbs.get(int(model.body_parentid[body]), 0), limb) for body, limb in limbs.items()]
-    return {above for above, limb in pairs if above not in (0, limb)}
 
 
 Touches = Callable[[Floats], int]
@@ -230,13 +224,11 @@ def _clear_pose(pose: Floats, amplitude: Floats, low: Floats, high: Floats, touc
     return pose
 
 
-def _slots(limb: Sequence[int], alone: set[int], pose: Floats, amplitude: Floats, touches: Touches) -> list[list[int]]:
-    """Each joint in the first slot of other limbs' joints that it cannot meet; one of ``alone`` has its own slot."""
+def _slots(limb: Sequence[int], pose: Floats, amplitude: Floats, touches: Touches) -> list[list[int]]:
+    """Each joint in the first slot of other limbs' joints that it cannot meet."""
     slots = list[list[int]]()
     for joint in range(len(pose)):
-        for slot in slots if limb[joint] not in alone else ():
-            if limb[slot[0]] in alone:
-                continue
+        for slot in slots:
             pairs = [_ends(pose, amplitude, [joint, other]) for other in slot]
             if limb[joint] not in [limb[other] for other in slot] and not any(map(touches, chain(*pairs))):
                 slot.append(joint)
