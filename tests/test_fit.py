@@ -161,17 +161,20 @@ def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
     fit._check_explained(Path("log"), CALF, joint._replace(after=0.05))
 
 
-@pytest.mark.parametrize(("name", "slots"), [("go2_flat", 3), ("g1_flat", 10)])
+@pytest.mark.parametrize(("name", "slots"), [("go2_flat", 3), ("g1_flat", 7)])
 def test_limbs_that_sweep_together_are_apart(name: str, slots: int) -> None:
     folder = POLICIES / name
     contract = read_contract(folder)
     plan = chirp.plan(contract, read_scene(folder, contract), Limits.of(folder, contract))
     assert sorted(joint for slot in plan.slots for joint in slot) == list(range(len(contract.joints)))
     assert len(plan.slots) == slots
-    for slot in plan.slots:
-        names = [contract.joints[joint] for joint in slot]
-        assert sum(joint.startswith("waist") for joint in names) < 2
-        assert len({joint.split("_")[0] for joint in names if "_hip_" in joint or "_knee_" in joint}) == sum("_hip_" in joint or "_knee_" in joint for joint in names)
+    for slot in plan.slots:  # two joints of a leg, or two of the waist, never sweep together
+        legs = [
+            contract.joints[joint].split("_")[0]
+            for joint in slot
+            if "knee" in contract.joints[joint] or "hip" in contract.joints[joint]
+        ]
+        assert len(legs) == len({*legs}) and sum("waist" in contract.joints[joint] for joint in slot) < 2
 
 
 def test_sweeps_keep_the_contracts_limits() -> None:

@@ -113,7 +113,8 @@ class Chirp(JointCheck):
 
     def _sweep(self, slot: Sequence[int]) -> Generator[Order, Measurement, None]:
         self._tell(f"{', '.join(self.joints[joint] for joint in slot)} sweep")
-        for targets in np.stack([self.targets(joint) for joint in slot], axis=1):
+        signs = (-1.0) ** np.arange(len(slot))  # neighbours move against each other, so that the root swings less
+        for targets in signs * np.stack([self.targets(joint) for joint in slot], axis=1):
             pose = self.plan.pose.copy()
             pose[slot] += targets
             yield self._held(pose)
