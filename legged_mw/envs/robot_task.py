@@ -358,7 +358,7 @@ class RobotTask(BaseTask):
     # ---- reward -----------------------------------------------------------------------------------------------------
 
     def compute_reward(self) -> None:
-        """Sum scale * term * dt over the terms, and clip. ``termination`` is added after the clip. Broken worlds get 0."""
+        """Sum scale * term * dt over the terms, and clip; ``termination`` is added after that. Broken worlds get 0."""
         rewards = self.cfg.rewards
         total = torch.zeros_like(self.rew_buf)
         if self._reward_terms:
