@@ -17,7 +17,7 @@ from legged_mw.sim.robot_file import Range, RobotFile
 from legged_mw.utils.errors import ModelError, unknown
 
 _BEYOND = 1e-3  # [rad] allowed rounding error of a pose outside of a range
-PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables without a value for some joints
+PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that may omit joints
 
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # position [m] and quaternion wxyz of an upright root
 _SIDES = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br"}
