@@ -1,4 +1,4 @@
-"""The border between a recorded step and a learner: rsl-rl's VecEnv. Inside are fixed buffers, outside are copies."""
+"""The interface between a recorded step and a learner: rsl-rl's VecEnv. Fixed buffers inside, copies outside."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Kept = TypeVar("Kept")
 
 
 class BaseTask(VecEnv):
-    """Holds the buffers that cross the border of the recorded step and runs it.
+    """Holds the inputs and outputs of the recorded step, and runs it.
 
-    Inside the step every tensor is fixed and written in place. The learner keeps references across steps, so ``step``
-    and ``reset`` return copies and copy their arguments.
+    In the step every tensor is fixed and written in place. The learner keeps references across steps, so ``step`` and
+    ``reset`` return copies and copy their arguments.
     """
 
     device: str
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
-    not_remembered = ""  # why no run can resume exactly: what the step writes beside its buffers, by check/'s guard
+    not_remembered = ""  # why a resume cannot be exact: state that is in no buffer, found by check/'s guard
 
     def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
         self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager
@@ -33,21 +33,21 @@ class BaseTask(VecEnv):
         self.actions = self.buffer(num_actions)
         self.rew_buf = self.buffer()
         self.reset_buf = self.buffer(dtype=torch.bool)  # the episode ended in this step
-        self.time_out_buf = self.buffer(dtype=torch.bool)  # it ended by the clock, or off the terrain; no fall
+        self.time_out_buf = self.buffer(dtype=torch.bool)  # it ended by the time limit or off the terrain
         self._episode_length_buf = self.buffer(dtype=torch.long)  # [control steps]
         self._graph = StepGraph(self._step, device, eager)
 
     def buffer(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
-        """Zeros (N, *shape) for the step to write in place; a resumed run restores them."""
+        """Make zeros (N, *shape) that the step writes in place and a resumed run restores."""
         return self.remember(torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device))
 
     def remember(self, kept: Kept) -> Kept:
-        """Register a tensor, a list or dict of them, or an object that lists its own in ``written``, for resuming."""
+        """Register a tensor, a list or dict of them, or an object with names in ``written``, for an exact resume."""
         self._remembered.append(kept)
         return kept
 
     def remembered(self) -> dict[str, Tensor]:
-        """All registered tensors, by the names of their attributes."""
+        """Name of the attribute -> tensor, for all registered tensors."""
         names = {id(value): name for name, value in reversed(vars(self).items())}
         found: dict[str, Tensor] = {}
         for place, kept in enumerate(self._remembered):
@@ -61,23 +61,23 @@ class BaseTask(VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
-        self._episode_length_buf.copy_(value)  # rsl-rl assigns a new tensor; the recorded step knows only this one
+        self._episode_length_buf.copy_(value)  # rsl-rl assigns a new tensor; the recorded step uses only this one
 
     def get_observations(self) -> TensorDict:
         """Copies of the observation groups, each (N, size)."""
         copies = {name: obs.clone() for name, obs in self.obs_buf.items()}
         return TensorDict(copies, batch_size=[self.num_envs], device=self.device)
 
-    @torch.no_grad()  # actions that carry gradients must not make the fixed buffers carry them
+    @torch.no_grad()  # actions with gradients must not give the fixed buffers gradients
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """One control step with ``actions`` (N, A). Returns copies of observations, reward (N,), done (N,), time outs.
 
-        Where done is true, the environment is already reset: its observation is the first of the next episode.
+        Where done is true, the environment is already reset and its observation is the first of the next episode.
         """
         if actions.shape != self.actions.shape:
             wanted, got = tuple(self.actions.shape), tuple(actions.shape)
             raise ValueError(f"actions must be {wanted} (environments, joints); got {got}")
-        with torch.inference_mode():  # cheaper for temporaries; the fixed buffers stay ordinary tensors
+        with torch.inference_mode():  # faster temporary tensors; the fixed buffers stay normal tensors
             self.actions.copy_(actions)
             self._graph()
         extras = {"time_outs": self.time_out_buf.clone()}
@@ -85,17 +85,17 @@ class BaseTask(VecEnv):
 
     @torch.no_grad()
     def reset(self) -> TensorDict:
-        """Begin a new episode everywhere; returns its first observations."""
+        """Reset all environments. Returns the first observations."""
         self._reset_all()
         return self.get_observations()
 
     def fuse(self, steps: int) -> None:
-        """Compile the step with legged_mw/fast, if the package exists and that pays over so many ``steps``."""
+        """Compile the step with legged_mw/fast, if the package exists and this saves time within ``steps``."""
         if fusion := fast("step_compiler"):
             fusion.fuse(self, steps)
 
     def _step(self) -> None:
-        """The recorded part: reads ``actions``; writes observations, reward, done and time out."""
+        """The recorded part. It reads ``actions`` and writes observations, reward, done and time out."""
         raise NotImplementedError
 
     def _reset_all(self) -> None:
@@ -103,7 +103,7 @@ class BaseTask(VecEnv):
 
 
 def _tensors(name: str, kept: Any) -> dict[str, Tensor]:
-    """The tensors of the registered ``kept``, called ``name``."""
+    """Name -> tensor of the registered ``kept``, whose name is ``name``."""
     if isinstance(kept, Tensor):
         return {name: kept}
     if isinstance(kept, dict | list | tuple):

@@ -1,8 +1,8 @@
-"""What differs between worlds: masses, friction, motors, encoders, delays. The config has ranges, KINDS their meaning.
+"""Domain randomization: masses, friction, motors, encoders, delays. The config has the ranges, KINDS their meaning.
 
-A number is drawn once, when the environment is made, or at every reset of its world (``redraw_at_reset``). All draws
-are columns of one matrix, for the critic, logs and exams to read. Numbers of the model are written through the
-simulator's seam. A range that changes nothing does not exist: it allocates no field and computes nothing.
+A value is drawn when the environment is made, or at every reset of its world (``redraw_at_reset``). All values are
+columns of one matrix, which the critic, logs and exams read. Model fields are written through ``Simulation.field``. A
+range that changes nothing is ignored: it allocates and computes nothing.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from legged_mw.utils.math import assign
 
 
 class Kind(NamedTuple):
-    """What one range of the config means."""
+    """The meaning of one range of the config."""
 
-    per: str  # numbers a world: "world" one, "axis" three, "joint" D, "link" 1 + D (the root's, then the joints')
-    neutral: float | None  # changes nothing; None: the number replaces the field's first one in the ground's geoms
+    per: str  # values per world: "world" 1, "axis" 3, "joint" D, "link" 1 + D (root, then joints)
+    neutral: float | None  # value without effect; None: the value replaces the first one of the field, on ground geoms
     mirror: str  # its mirror image, a kind of envs/mirror.py
-    fields: tuple[str, ...] = ()  # of the model, that it writes; for FACTORS see motors.factor_fields
-    whole: bool = False  # whole numbers, both ends included
+    fields: tuple[str, ...] = ()  # model fields that it writes; for FACTORS see motors.factor_fields
+    whole: bool = False  # integers, both ends included
 
 
 KINDS: dict[str, Kind] = {
@@ -50,12 +50,12 @@ KINDS: dict[str, Kind] = {
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
     "slope": Kind("world", 0.0, "scalar", (GRAVITY,)),
 }
-# Constants of the model depend on them. They are derived after such a draw, which a recorded step cannot do.
+# Constants of the model depend on these. A draw must compute them again, which a recorded step cannot do.
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
 
 def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, float]]:
-    """Name -> kind, low, high of each range that changes something; ``law``: by default ``control.actuator``."""
+    """Name -> kind, low, high of each range with an effect. ``law``: by default ``control.actuator``."""
     rand, motors = cfg.domain_rand, factor_fields(cfg, law or cfg.control.actuator)
     if not rand.enable:
         return {}
@@ -70,14 +70,14 @@ def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, flo
 
 
 def world_fields(cfg: RobotTaskCfg, law: str = "") -> list[str]:
-    """Model fields with a value per world. ``model_factors`` are all named: the simulator refuses unknown ones."""
+    """Model fields with a value per world. All ``model_factors`` are included: the simulator rejects unknown fields."""
     factors = cfg.domain_rand.model_factors if cfg.domain_rand.enable else {}
     written = [field for kind, _, _ in active(cfg, law).values() for field in kind.fields]
     return list(dict.fromkeys([*written, *factors]))
 
 
 def check_draws(cfg: RobotTaskCfg, law: str = "") -> None:
-    """Raise ConfigError for a range that no reset can draw, and for two ranges that write one field."""
+    """Raise ConfigError for a range that cannot be drawn at a reset, and for two ranges that write the same field."""
     for name in cfg.domain_rand.redraw_at_reset:
         if name in ONLY_AT_START:
             what = f"domain_rand.redraw_at_reset has '{name}', which constants of the model depend on"
@@ -92,7 +92,7 @@ def check_draws(cfg: RobotTaskCfg, law: str = "") -> None:
 
 
 class DomainRand:
-    """The draws of N worlds, and their writes to the model. ``values[name]`` (N, width) are in the config's units."""
+    """Draws the values of N worlds and writes them to the model. ``values[name]`` (N, width) has the config's unit."""
 
     written = ("_draws", "gravity_dir")
 
@@ -100,10 +100,10 @@ class DomainRand:
         self._sim, self._substep_ms, self._curves = sim, 1e3 * cfg.sim.dt, "stall_torque" in robot.tables
         kinds = active(cfg, law)
         again = [name for name in kinds if name in cfg.domain_rand.redraw_at_reset]
-        order = [name for name in kinds if name not in again] + again  # a reset draws the last columns
+        order = [name for name in kinds if name not in again] + again  # a reset draws only the last columns
         joints = len(robot.joint_names)
         count = {"world": 1, "axis": 3, "joint": joints, "link": 1 + joints}
-        self.widths = {name: count[kind.per] for name, kind in KINDS.items()}  # of each draw, drawn here or not
+        self.widths = {name: count[kind.per] for name, kind in KINDS.items()}  # width of each kind, active or not
         widths = [count[kinds[name][0].per] for name in order]
         self._first_again = sum(widths[: len(order) - len(again)])
         self._draws = torch.zeros(sim.num_envs, sum(widths), device=sim.device)
@@ -127,7 +127,7 @@ class DomainRand:
         self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
 
     def redraw(self) -> None:
-        """Draw everything again in every world, and derive the model's constants. Not for inside a recorded step."""
+        """Draw all values in all worlds and compute the model's constants. Do not call it in a recorded step."""
         everywhere = torch.ones(self._sim.num_envs, dtype=torch.bool, device=self._sim.device)
         self._draw(everywhere, 0)
         for write in self._writers:
@@ -143,7 +143,7 @@ class DomainRand:
                 write(mask)
 
     def _draw(self, mask: Tensor, first: int) -> None:
-        """Draw uniformly from column ``first`` on; whole numbers are equally likely."""
+        """Draw the columns from ``first`` on, from uniform distributions."""
         draws, low, high = self._draws[:, first:], self._low[first:], self._high[first:]
         if not draws.shape[1]:
             return
@@ -159,7 +159,7 @@ class DomainRand:
         assign(draws, mask, fresh)
 
     def _writer(self, name: str, field: str) -> Callable[[Tensor], None]:
-        """What writes the draw ``name``, which begins with the model's ``field``, where a mask is true."""
+        """The function that writes the draw ``name`` to the model where a mask is true. ``field``: its first field."""
         special = {
             "body_mass": self._write_masses,
             "body_ipos": self._write_com,
@@ -176,13 +176,13 @@ class DomainRand:
 
     def _scale(self, name: str, field: str, mask: Tensor) -> None:
         factor, nominal = self.values[name], self._nominal[field]
-        first = nominal.shape[1] - factor.shape[1] if name in KINDS else 0  # the free joint's six come first
+        first = nominal.shape[1] - factor.shape[1] if name in KINDS else 0  # skip the six of the free joint
         nominal = nominal[:, first:]
         scaled = nominal * factor.view(*factor.shape, *[1] * (nominal.dim() - 2))
         assign(self._sim.field(field)[:, first:], mask, scaled)
 
     def _write_masses(self, mask: Tensor) -> None:
-        """Write masses, and inertias in proportion [ours]."""
+        """Write masses, and inertias proportional to them [ours]."""
         nominal = self._nominal["body_mass"]
         mass = nominal.expand(self._sim.num_envs, -1).clone()
         if "link_mass" in self.values:
@@ -198,19 +198,19 @@ class DomainRand:
         assign(self._sim.field("body_ipos")[:, self._root], mask, place)
 
     def _write_gains(self, mask: Tensor) -> None:
-        """Write the gains of motors and their torque-speed curves."""
+        """Write motor gains and torque-speed curves."""
         for field, place, gains in scaled_gains(self._nominal, self.values, self._curves):
             assign(self._sim.field(field)[:, :, place], mask, gains)
 
     def _write_gravity(self, mask: Tensor) -> None:
-        """Lean gravity towards x, downhill; robots with any heading see any direction."""
+        """Tilt gravity towards x, which is downhill. Random headings give all directions in the body frame."""
         angle = torch.deg2rad(self.values["slope"])
         assign(self.gravity_dir, mask, torch.cat([angle.sin(), torch.zeros_like(angle), -angle.cos()], dim=1))
         assign(self._sim.field(GRAVITY), mask, self._gravity * self.gravity_dir)
 
 
 def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:
-    """Raise ConfigError if a draw could leave the root without mass."""
+    """Raise ConfigError if the drawn mass of the root can be 0 or negative."""
     kinds, nominal = active(cfg), float(robot.physics.body_mass[robot.id("body", robot.root)])
     lightest = nominal * kinds.get("link_mass", (0, 1.0))[1] + kinds.get("base_mass", (0, 0.0))[1]
     if lightest <= 0.0:
@@ -219,7 +219,7 @@ def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:
 
 
 def _links(robot: RobotModel) -> Tensor:
-    """The column of "link_mass" of each body: 0 the root's, 1 + j joint j's, 1 + D outside of the robot."""
+    """The column of "link_mass" for each body: 0 root, 1 + j link of joint j, 1 + D not part of the robot."""
     model = robot.physics
     weld = {int(model.body_weldid[robot.id("body", robot.root)]): 0}
     for column, name in enumerate(robot.joint_names, start=1):

@@ -1,9 +1,9 @@
 """Feet: their contacts with the ground, and the gait clock.
 
-The clock says where each foot is in its step, for the policy and for rewards. A world's phase runs from 0 to 1 in
-``gait.period``; each foot's phase is that plus its offset. A foot stands in the first share of its phase
-(``gait.stance``) and swings in the rest. While the command is to stand, the clock rests at 0; it starts from 0 when the
-command is to move. ``legged_mw.deploy.controller`` keeps the same clock.
+The clock gives the policy and the rewards the phase of each foot. The phase of a world rises from 0 to 1 in
+``gait.period``; the phase of a foot is that plus its offset. In the first part of its phase (``gait.stance``) a foot is
+in stance, then in swing. With the command to stand, the clock stays at 0; it starts when the command is to move.
+``legged_mw.deploy.controller`` has the same clock.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from legged_mw.utils.config import ConfigError
 
 
 class FootContacts:
-    """The number of contacts of each of F feet with the ground, and the force on it where that is sensed.
+    """The number of ground contacts of each of F feet, and the contact force if it is sensed.
 
     A foot may have several geoms.
     """
 
     written = ("count", "forces")
-    forces: Tensor | None = None  # (N, F, 3) of the ground on the foot, world frame [N]; only if a term or row reads it
+    forces: Tensor | None = None  # (N, F, 3) force of the ground on the foot, world frame [N]; only if it is sensed
 
     def __init__(self, robot: RobotModel, feet: Collection[tuple[str, ...]], sensed: Tensor, count: Tensor) -> None:
-        """``feet`` are the geoms of each, the first columns of ``count`` (N, C); ``sensed`` are all sensors' values."""
+        """``feet``: geoms of each foot, the first columns of ``count`` (N, C). ``sensed``: values of all sensors."""
         geoms = list(dict.fromkeys(geom for each in feet for geom in each))  # G
         table = torch.tensor([[float(geom in each) for each in feet] for geom in geoms], device=count.device)  # (G, F)
         self._foot_of_geom = table if [(geom,) for geom in geoms] != [*feet] else None
@@ -42,7 +42,7 @@ class FootContacts:
             self.forces = count.new_zeros(len(count), len(feet), 3)
 
     def update(self) -> None:
-        """Read the contacts of the last substep."""
+        """Update from the contacts of the last substep."""
         if self._foot_of_geom is not None:
             torch.mm(self._counts, self._foot_of_geom, out=self.count)
         if self.forces is not None:
@@ -50,35 +50,35 @@ class FootContacts:
 
 
 class GaitClock:
-    """The clocks of N worlds with F feet: fixed tensors, written in place."""
+    """The gait clocks of N worlds with F feet, in fixed tensors."""
 
     written = ("phase", "running", "foot_phase", "row")
 
     def __init__(
         self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str
     ) -> None:
-        """``dt`` [s] is a control step. Raises ConfigError unless there is one offset a foot."""
+        """``dt``: control step [s]. Raises ConfigError unless there is one offset per foot."""
         self.offsets = _offsets(cfg, feet)
         self.stance, self._random_start = cfg.stance, cfg.random_start
-        self._share = dt / cfg.period  # of the period in a control step
+        self._share = dt / cfg.period  # phase per control step
         self._shift = torch.tensor(self.offsets, device=device)  # (F,)
-        self.phase = torch.zeros(num_envs, device=device)  # (N,) share of the period, as last observed
-        self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) last observed: commanded to move
+        self.phase = torch.zeros(num_envs, device=device)  # (N,) 0 to 1, as last observed
+        self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) command to move, as last observed
         self.foot_phase = torch.zeros(num_envs, len(feet), device=device)  # (N, F) from 0 to 1
         self.row = torch.zeros(num_envs, 2 * len(feet), device=device)  # sines of the phases, then cosines; 0 at rest
 
     def tick(self) -> None:
-        """Advance the running clocks by a control step."""
+        """Advance the running clocks by one control step."""
         self.phase.add_(self.running, alpha=self._share).remainder_(1.0)
 
     def restart(self, mask: Tensor) -> None:
-        """Start anywhere in the period where ``mask`` (N,) is true, so that each leg learns to lead."""
+        """Start at a random phase where ``mask`` (N,) is true, so that each leg learns to make the first step."""
         start = torch.rand_like(self.phase) if self._random_start else torch.zeros_like(self.phase)
         self.phase.copy_(torch.where(mask, start, self.phase))
-        self.running.logical_or_(mask)  # ``observe`` stops it if the command is to stand
+        self.running.logical_or_(mask)  # ``observe`` stops the clock if the command is to stand
 
     def observe(self, moving: Tensor) -> None:
-        """Fill ``row`` for the next observation, where ``moving`` (N,) means to move. A second call changes nothing."""
+        """Fill ``row`` for the next observation. ``moving`` (N,): command to move. A second call changes nothing."""
         self.phase.masked_fill_(~moving, 0.0)
         self.running.copy_(moving)
         torch.add(self.phase[:, None], self._shift, out=self.foot_phase).remainder_(1.0)
@@ -86,17 +86,17 @@ class GaitClock:
         self.row.copy_(torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)).masked_fill_(~moving[:, None], 0.0)
 
     def swing(self) -> Tensor:
-        """The progress of each foot in its swing (N, F), from 0 to 1; 0 in stance and at rest."""
+        """Progress of each foot's swing (N, F), from 0 to 1; 0 in stance and at rest."""
         share = (self.foot_phase - self.stance).clamp(min=0.0) / (1.0 - self.stance)
         return share.masked_fill(~self.running[:, None], 0.0)
 
     def wants_contact(self) -> Tensor:
-        """The feet that should stand (N, F); all at rest."""
+        """True for feet that should be in contact (N, F); all of them at rest."""
         return (self.foot_phase < self.stance) | ~self.running[:, None]
 
 
 def _offsets(cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...]) -> list[float]:
-    """The config's offsets, one a foot; without them two feet are half a period apart."""
+    """The offsets of the config, one per foot. The default for two feet is half a period."""
     if cfg.offsets and len(cfg.offsets) == len(feet):
         return list(cfg.offsets)
     if not cfg.offsets and len(feet) == 2:

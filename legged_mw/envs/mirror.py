@@ -1,12 +1,13 @@
-"""The robot's mirror image, left for right: a signed permutation of the columns of observations and actions.
+"""The left-right mirror image of the robot: a signed permutation of the columns of observations and actions.
 
-It is made from the column ``mirror`` of the observation table when ``RobotTask.mirror`` is first read; the step does
-not use it. The mirror is the x-z plane: the root's for values in the body frame, the world's for values in the world
-frame. Both have the same formula.
+It is made from the field ``mirror`` of the observation rows when ``RobotTask.mirror`` is first read. The step does not
+use it. The mirror plane is x-z, of the root for values in the body frame and of the world for values in the world
+frame. The formula is the same.
 
-An IMU beside the plane (Go1: 67 mm) does not change sides. Its mirrored velocity therefore has a second term, the
-angular velocity times twice that distance: kinds "imu_velocity" and "command". The accelerometer would need the angular
-acceleration, and is mirrored as if it were in the plane. Joints and feet are checked, masses are not.
+If the IMU is not in the plane (Go1: 67 mm beside it), the mirrored robot has its IMU on the other side. The mirrored
+velocity therefore has a second term: angular velocity times twice the distance (kinds "imu_velocity" and "command").
+For the accelerometer this term would need the angular acceleration, so it is left out. Joints and feet are checked for
+symmetry, masses are not.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ NO_MIRROR = "learn without mirror images: symmetry.use_data_augmentation = False
 
 
 class Block(NamedTuple):
-    """Columns that mirror among themselves. A row holds any number of blocks, one after another."""
+    """Columns whose mirror images are in the same columns. A row consists of one or more blocks."""
 
-    index: list[int]  # column that each is taken from
+    index: list[int]  # source column of each column
     sign: list[float]  # +1 or -1, times the ratio of the two columns' scales
     shifts: list[tuple[int, int, float]] = []  # (to, from, factor): mirrored column += factor * unmirrored column
 
 
 class Columns(NamedTuple):
-    """``x[:, index] * sign``, plus ``x[:, source] * factor`` in columns ``target``. Twice gives ``x`` back."""
+    """``x[:, index] * sign``, plus ``x[:, source] * factor`` in columns ``target``. Applied twice it gives ``x``."""
 
-    index: Tensor  # (size,) int64, column that this one is taken from
-    sign: Tensor  # (size,) +1 or -1, where the columns of a pair have the same scale
+    index: Tensor  # (size,) int64, source column of each column
+    sign: Tensor  # (size,) +1 or -1 if both columns of a pair have the same scale
     target: Tensor  # (S,) int64
     source: Tensor  # (S,) int64
     factor: Tensor  # (S,)
@@ -60,18 +61,18 @@ class Mirror(NamedTuple):
 
 
 def make_mirror(groups: Mapping[str, Sequence[Row]], blocks: dict[str, Block], reach: float, device: str) -> Mirror:
-    """The mirror of the table's groups. ``blocks``: the kinds by name; ``reach`` [m]: from the mirrored IMU to the IMU.
+    """The mirror of the groups. ``blocks``: name of a kind -> block; ``reach`` [m]: from the mirrored IMU to the IMU.
 
-    Raises ConfigError for a row that has no mirror image.
+    Raises ConfigError for a row without a mirror image.
     """
     blocks = dict(blocks)
     for group, rows in groups.items():
-        blocks[group] = _group_block(group, rows, blocks, reach)  # rows of later groups may contain this one
+        blocks[group] = _group_block(group, rows, blocks, reach)  # later groups may contain this one
     return Mirror({group: _columns(blocks[group], device) for group in groups}, _columns(blocks["joint"], device))
 
 
 def _columns(block: Block, device: str) -> Columns:
-    with torch.inference_mode(False):  # whatever mode the caller is in: mirrored actions of a loss carry gradients
+    with torch.inference_mode(False):  # the mirror loss needs gradients, also if this call is in inference mode
         index = torch.tensor(block.index, dtype=torch.long, device=device)
         sign = torch.tensor(block.sign, dtype=torch.float, device=device)
         target, source, factor = torch.tensor(block.shifts, dtype=torch.float, device=device).view(-1, 3).T.contiguous()
@@ -79,21 +80,21 @@ def _columns(block: Block, device: str) -> Columns:
 
 
 def robot_blocks(partners: Partners) -> dict[str, Block]:
-    """Kinds of mirror image that every robot has."""
+    """Kinds of mirror image for all robots."""
     joints = Block(list(partners.joints), [float(sign) for sign in partners.signs])
     return {
         "scalar": Block([0], [1.0]),  # the same on both sides
         "polar": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # x, -y, z: a velocity, a force, a direction
         "axial": Block([0, 1, 2], [-1.0, 1.0, -1.0]),  # -x, y, -z: an angular velocity
-        "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # body frame; shifted by the row "base_ang_vel" beside it
-        "joint": joints,  # a number a joint
-        "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # likewise, whatever the axis's direction
+        "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # body frame; with shifts from the row "base_ang_vel"
+        "joint": joints,  # one value per joint
+        "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # one value per joint, without a sign
         "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # root's, then joints'
     }
 
 
 def foot_blocks(partners: Partners) -> dict[str, Block]:
-    """Kinds of mirror image for rows with a number, or a polar vector, for each foot."""
+    """Kinds of mirror image for rows with one value, or one polar vector, per foot."""
     feet = list(partners.sites)
     polar = Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet))
     return {"foot": Block(feet, [1.0] * len(feet)), "foot_polar": polar}
@@ -102,7 +103,7 @@ def foot_blocks(partners: Partners) -> dict[str, Block]:
 def body_blocks(robot: RobotModel, partners: Partners, names: Sequence[str]) -> dict[str, Block]:
     """Kinds of mirror image for rows with a vector or a turn for each of the bodies ``names``.
 
-    A turn is the first two columns of a rotation matrix, row by row. Raises ConfigError for a body without its partner.
+    A turn is the first two columns of a rotation matrix, row by row. Raises ConfigError if a body's partner is missing.
     """
     model = robot.physics
     carried = [int(model.joint(name).bodyid[0]) for name in robot.joint_names]  # the body that each joint moves
@@ -121,7 +122,7 @@ def body_blocks(robot: RobotModel, partners: Partners, names: Sequence[str]) -> 
 
 
 def command_block(table: Sequence[Command], reach: float) -> Block:
-    """The mirrored commands: vx, -vy, -yaw rate at the IMU; of other commands what ``commands.mirror`` states."""
+    """The mirrored commands: vx, -vy, -yaw rate at the IMU; others by ``commands.mirror``. Raises ConfigError."""
     names = [command.name for command in table]
     for command in table:
         if command.mirror is None:
@@ -133,7 +134,7 @@ def command_block(table: Sequence[Command], reach: float) -> Block:
 
 
 def scan_block(xs: Sequence[float], ys: Sequence[float]) -> Block:
-    """The mirrored points (x, -y) of the height scan. Raises ConfigError for a lopsided grid."""
+    """The mirrored points (x, -y) of the height scan. Raises ConfigError for a grid that is not symmetric."""
     if any(abs(left + right) > 1e-6 for left, right in zip(sorted(ys), sorted(ys, reverse=True), strict=True)):
         what = f"terrain.measured_points_y {list(ys)} is not its own mirror image"
         raise ConfigError(f"{what}; make it so, or {NO_MIRROR}")
@@ -142,7 +143,7 @@ def scan_block(xs: Sequence[float], ys: Sequence[float]) -> Block:
 
 
 def check_pose(names: Sequence[str], pose: Sequence[float], partners: Partners) -> None:
-    """Raise ConfigError unless the default pose (D,) is its own mirror image: action 0 is that pose on both sides."""
+    """Raise ConfigError unless the default pose (D,) is symmetric, because action 0 is that pose on both sides."""
     for i, (j, sign) in enumerate(zip(partners.joints, partners.signs, strict=True)):
         if abs(pose[i] - sign * pose[j]) > 1e-6:
             image = "its own mirror image" if i == j else f"the mirror image of {pose[j]:g} rad at '{names[j]}'"
@@ -152,7 +153,7 @@ def check_pose(names: Sequence[str], pose: Sequence[float], partners: Partners) 
 
 
 def _group_block(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], reach: float) -> Block:
-    """The block of a whole group: its rows' blocks side by side, with their scales."""
+    """The block of a group: the blocks of its rows in order, with their scales."""
     whole, starts = Block([], [], []), dict[str, int]()
     for row in rows:
         where = f"observation row '{row.name}' of '{group}'"
@@ -184,7 +185,7 @@ def _group_block(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], r
 def _imu_shifts(
     group: str, row: Row, rows: Sequence[Row], starts: Mapping[str, int], reach: float
 ) -> list[tuple[int, int, float]]:
-    """The second term of the IMU's velocity ``row``: each frame takes the same frame of the row "base_ang_vel"."""
+    """The second term of the IMU's velocity ``row``. Each frame uses the same frame of the row "base_ang_vel"."""
     rates = next((each for each in rows if each.name == "base_ang_vel"), None)
     if rates is None:
         where = f"observation row '{row.name}' of '{group}'"
@@ -193,7 +194,7 @@ def _imu_shifts(
         what = f"'{group}.{row.name}' has {row.history} frames, so 'base_ang_vel' needs as many"
         raise ConfigError(f"observations.history: {what}")
     shifts = []
-    for back in range(1, row.history + 1):  # frames are oldest first, so both are counted from the newest
+    for back in range(1, row.history + 1):  # count from the newest frame, as the oldest is first
         velocity = starts[row.name] + 3 * (row.history - back)
         rate = starts["base_ang_vel"] + 3 * (rates.history - back)
         shifts += [(velocity, rate + 2, reach), (velocity + 2, rate, -reach)]  # 2y wz in x, -2y wx in z

@@ -1,8 +1,8 @@
-"""Where a motor's torque comes from: the motor laws, and the action scale, delays and encoders around them.
+"""From an action to a motor torque: action scale, delays, encoder offsets and motor laws.
 
-``control.actuator`` is the law, or a task's own ``_compute_torques``. Servos, DC motors and plain torques are MuJoCo's
+The law is ``control.actuator``, or a task's own ``_compute_torques``. Servos, DC motors and plain torques are MuJoCo's
 actuators: ``sim/servos.py`` writes their gains, curves and force limits into the model. ``Actuators.before`` computes
-what changes within a control step: networks, laws in code, and late commands. Shapes: N robots, D joints.
+networks, laws in code and delayed commands before each substep. Shapes: N robots, D joints.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
 from legged_mw.utils.motor_network import MotorNetwork, read_network
 
-OWN = "own"  # beside the names of ``control.actuator``: the law of a class with a _compute_torques of its own
-FACTORS = ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")  # of ``domain_rand``, on motors
+OWN = "own"  # law of a class that overrides _compute_torques; the other names are those of ``control.actuator``
+FACTORS = ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")  # of motors, in ``domain_rand``
 
 
 def own_law(cfg: RobotTaskCfg, task: str) -> str:
-    """OWN, for a class ``task`` that overrides ``_compute_torques``. Raises ConfigError if the config has a law too."""
+    """OWN, for a class ``task`` with its own ``_compute_torques``. Raises ConfigError if the config also sets a law."""
     for field, default in (("actuator", "servo"), ("action_origin", "default")):
         if (value := getattr(cfg.control, field)) != default:
             what = f"control.{field} is {value!r}, but {task}._compute_torques is a motor law of its own"
@@ -39,32 +39,32 @@ def own_law(cfg: RobotTaskCfg, task: str) -> str:
 
 
 def has_curve(cfg: RobotTaskCfg, law: str) -> bool:
-    """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` always, a servo never, others by the config."""
+    """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` always, servo never, others if configured."""
     return law == "dc_motor" or (law != "servo" and bool(cfg.control.stall_torque or cfg.control.no_load_speed))
 
 
 def motor_drive(cfg: RobotTaskCfg, law: str) -> Drive:
-    """The input of the simulated motors under ``law``."""
+    """The input of the simulated motors for ``law``."""
     if law not in ("servo", "dc_motor"):
         return "torque"
     return "speed" if cfg.control.action_origin == "speed" else "angle"
 
 
 def motor_gains(cfg: RobotTaskCfg, law: str) -> dict[str, Mapping[str, float]]:
-    """The tables "stiffness" and "damping"; zeros where ``law`` has no such gain and the config gives none."""
+    """The tables "stiffness" and "damping"; zeros if the config has none and ``law`` does not need it."""
     control, none = cfg.control, {"": 0.0} if law in ("torque", "network") else {}
     stiffness = {"": 0.0} if motor_drive(cfg, law) == "speed" else control.stiffness or none
     return {"stiffness": stiffness, "damping": control.damping or none}
 
 
 def motor_curves(cfg: RobotTaskCfg, law: str) -> Mapping[str, Mapping[str, float]]:
-    """The tables of the torque-speed curve; none without a curve."""
+    """The tables of the torque-speed curve, or {} without a curve."""
     tables = ("stall_torque", "no_load_speed", "gear") if has_curve(cfg, law) else ()
     return {name: getattr(cfg.control, name) for name in tables}
 
 
 def factor_fields(cfg: RobotTaskCfg, law: str) -> dict[str, tuple[str, ...]]:
-    """Those of FACTORS that motors of ``law`` have -> model fields that they scale; a law in code reads its gains."""
+    """Factor of FACTORS that applies to ``law`` -> model fields that it scales; () if a law in code reads the gain."""
     fields: dict[str, tuple[str, ...]] = {"strength": ("actuator_forcerange",)}
     if law == "servo":
         fields |= {"stiffness": ("actuator_gainprm", "actuator_biasprm"), "damping": ("dof_damping",)}
@@ -80,7 +80,7 @@ def factor_fields(cfg: RobotTaskCfg, law: str) -> dict[str, tuple[str, ...]]:
 
 
 def note_network(cfg: RobotTaskCfg) -> None:
-    """Write the digest of the file ``control.network`` into the config, unless a training wrote it before."""
+    """Write the digest of the file ``control.network`` into the config, unless it is already there."""
     control = cfg.control
     if control.actuator == "network" and control.network and control.network not in control.network_digest:
         control.network_digest = {control.network: digest(find_file(cfg, "control.network"))}
@@ -100,14 +100,14 @@ def find_network(cfg: RobotTaskCfg) -> Path:
 
 
 class Actuators:
-    """Motors of N robots with D joints. The target is origin + scale * action; under "torque" it is scale * action.
+    """Motors of N robots with D joints. The target is origin + scale * action; with "torque" it is scale * action.
 
     ``control.action_origin`` is the origin: "default" the default pose, "joints" the measured joint angles, "targets"
-    the last targets; with "speed" there is none, and targets are speeds [rad/s].
+    the last targets. With "speed" there is no origin, and targets are speeds [rad/s].
     """
 
     written = ("targets", "_sent", "_delay", "_late", "_network")
-    # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
+    # ``Simulation.step`` calls it before each substep; None: ``ctrl`` is constant within a step
     before: Callable[[int], None] | None = None
 
     def __init__(
@@ -116,7 +116,7 @@ class Actuators:
         law: str,
         robot: RobotModel,
         sim: Simulation,
-        drawn: Mapping[str, Tensor],  # of DomainRand
+        drawn: Mapping[str, Tensor],  # ``DomainRand.values``
         default: Tensor,  # (D,) the default pose [rad]
         compute: Callable[[Tensor], Tensor],  # the task's ``_compute_torques``, for the law OWN
     ) -> None:
@@ -128,31 +128,31 @@ class Actuators:
         by_angle = law not in ("torque", OWN) and self._origin != "speed"
         self.encoder_offset = drawn.get("encoder_offset")  # (N, D) [rad], measured minus true angle
         self._offset = self.encoder_offset if by_angle else None
-        self._start: Tensor | float = default if by_angle else 0.0  # targets of a new episode
+        self._start: Tensor | float = default if by_angle else 0.0  # targets at the start of an episode
         self._delay: Delay | None = None
         if "action_delay" in drawn:
             self._delay = Delay(cfg, "action_delay", drawn["action_delay"], len(scale), start=0.0)
         self._late = SubstepDelay(cfg, drawn["delay_ms"], len(scale)) if "delay_ms" in drawn else None
-        # (N, D) sent to the motors: targets minus encoder offsets, torques, or under OWN actions
+        # (N, D) sent to the motors: targets minus encoder offsets, torques, or actions for OWN
         self._sent = sim.ctrl
         if self._late or law in ("network", OWN):
             self._sent, self.before = torch.zeros_like(sim.ctrl), self._before_substep
         self._network: NetworkLaw | None = None
         if law == "network":
             self._network = NetworkLaw(read_network(find_network(cfg)), self._dof_pos, sim.qvel[:, 6:])
-        # (N, D) by the encoders, as the policy means them
+        # (N, D) in encoder angles, as the policy commands them
         self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)
 
     def sent(self) -> Tensor:
-        """(N, D) The last motor commands, as the policy means them."""
+        """(N, D) The last motor commands in encoder angles, as the policy commands them."""
         return self._sent if self._offset is None else self._sent + self._offset
 
     def gain(self, name: str) -> Tensor:
-        """ "stiffness" or "damping", (D,), or (N, D) where it is drawn."""
+        """The gain "stiffness" or "damping": (D,), or (N, D) if it is randomized."""
         return self._gains[name] * self._drawn[name] if name in self._drawn else self._gains[name]
 
     def apply(self, actions: Tensor) -> None:
-        """Send the motors the commands of ``actions`` (N, D)."""
+        """Compute the motor commands of ``actions`` (N, D)."""
         actions = self._delay(actions) if self._delay else actions
         if self.law == OWN:
             self._sent.copy_(actions)
@@ -166,7 +166,7 @@ class Actuators:
             self._late(self._sent)
 
     def _origin_angles(self) -> Tensor:
-        """(D,) or (N, D) [rad]."""
+        """The origin of the targets, (D,) or (N, D) [rad]."""
         if self._origin == "targets":
             return self.targets
         if self._origin == "joints":
@@ -174,7 +174,7 @@ class Actuators:
         return self._default
 
     def _before_substep(self, k: int) -> None:
-        """Write ``ctrl`` for substep ``k``. Raises ConfigError if a law in code returns no torque a joint."""
+        """Write ``ctrl`` for substep ``k``. Raises ConfigError unless a law in code returns one torque per joint."""
         sent = self._late.arriving[k] if self._late else self._sent
         if self._network:
             sent = self._network(sent)
@@ -189,7 +189,7 @@ class Actuators:
         self._sim.ctrl.copy_(sent)
 
     def reset(self, mask: Tensor) -> None:
-        """Where ``mask`` (N,) is true: targets at the default pose, torques and speeds 0, delays and networks empty."""
+        """Where ``mask`` (N,) is true, reset targets to the default pose or 0, and clear delays and networks."""
         assign(self.targets, mask, self._start)
         if self._offset is not None:
             assign(self._sent, mask, self._default - self._offset)
@@ -210,15 +210,15 @@ _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 
 class NetworkLaw:
-    """A network as the motors of all joints: ``law(targets)`` is called before each substep, and recorded with it.
+    """A network as the motor model of all joints: ``law(targets)`` is called before each substep, in the recorded step.
 
-    It computes in float32, whatever the precision of the learner's matrix products (``runner.matmul_precision``).
+    It always computes in float32; ``runner.matmul_precision`` does not change it.
     """
 
     written = ("_past", "_memory")
 
     def __init__(self, network: MotorNetwork, angle: Tensor, speed: Tensor) -> None:
-        """Each call reads the joint angles [rad] and speeds [rad/s], (N, D)."""
+        """``angle`` [rad] and ``speed`` [rad/s] of the joints (N, D) are read in each call."""
         self._network, self._angle, self._speed, (robots, joints) = network, angle, speed, angle.shape
 
         def tensor(weights: Any) -> Tensor:
@@ -227,9 +227,9 @@ class NetworkLaw:
         self._recurrent = [[tensor(weights) for weights in layer] for layer in network.recurrent]
         self._linear = [(tensor(weight), tensor(bias)) for weight, bias in network.linear]
         self._frames = tensor(network.frames)
-        # scaled errors and speeds of the last simulation steps, newest first
+        # scaled position errors and speeds of the last simulation steps, newest first
         self._past = torch.zeros(network.frames[-1] + 1, 2, robots, joints, device=angle.device)
-        # h and c of each LSTM layer
+        # hidden state h and cell state c of each LSTM layer
         self._memory = [torch.zeros(2, robots * joints, units, device=angle.device) for units in network.hidden]
 
     def __call__(self, targets: Tensor) -> Tensor:
@@ -257,20 +257,20 @@ class NetworkLaw:
         return x
 
     def reset(self, mask: Tensor) -> None:
-        """Forget the past errors, speeds and memory where ``mask`` (N,) is true."""
+        """Clear past errors, speeds and hidden states where ``mask`` (N,) is true."""
         self._past.masked_fill_(mask[:, None], 0.0)
         for memory in self._memory:
             memory.unflatten(1, (len(mask), -1)).masked_fill_(mask[:, None, None], 0.0)
 
 
 class Delay:
-    """``delay(now)``, called once a step with a value (N, width), returns that of d steps ago; each world has its d."""
+    """``delay(now)``, called once per step with values (N, width), returns those of d steps ago; d is per world."""
 
     written = ("past", "_new")
 
     def __init__(self, cfg: RobotTaskCfg, name: str, steps: Tensor, width: int, start: float | None = None) -> None:
-        """Each call reads ``steps`` (N, 1), drawn by ``domain_rand.<name>``. Before an episode the value was ``start``;
-        None: the episode's first one.
+        """``steps`` (N, 1), drawn by ``domain_rand.<name>``, is read in each call. ``start``: value before the start of
+        an episode; None: the first value of the episode.
         """
         self.steps, self.start, longest = steps, start, int(getattr(cfg.domain_rand, name)[1])
         _require_memory(cfg, name, steps, longest + 1, width)
@@ -278,7 +278,7 @@ class Delay:
         self._new = torch.ones(len(steps), dtype=torch.bool, device=steps.device)
 
     def restart(self, mask: Tensor) -> None:
-        """An episode begins where ``mask`` (N,) is true."""
+        """Start an episode where ``mask`` (N,) is true."""
         if self.start is None:
             self._new.logical_or_(mask)
         else:
@@ -295,40 +295,40 @@ class Delay:
 
 
 class SubstepDelay:
-    """Delays motor commands, sent once a control step, by whole simulation steps; each world has its own delay.
+    """Delays the motor commands of each control step by whole simulation steps. Each world has its own delay.
 
-    A command with a delay of d steps arrives before substep d of those that follow. For example, 7 ms in steps of 4 ms
-    is d = 2: physics from t + 8 ms on uses the command sent at t.
+    A command with a delay of d steps arrives d substeps after it was sent. For example, 7 ms with substeps of 4 ms is
+    d = 2: physics uses the command of time t from t + 8 ms on.
     """
 
     written = ("_past", "arriving")
 
     def __init__(self, cfg: RobotTaskCfg, delay: Tensor, width: int) -> None:
-        """Each call reads ``delay`` (N, 1) [ms], whole simulation steps within ``domain_rand.delay_ms``."""
+        """``delay`` (N, 1) [ms], whole simulation steps within ``domain_rand.delay_ms``, is read in each call."""
         self._delay, self._step_ms, substeps = delay, 1e3 * cfg.sim.dt, cfg.control.decimation
         longest = round_delay(cfg.domain_rand.delay_ms[1], self._step_ms) / self._step_ms  # [simulation steps]
         _require_memory(cfg, "delay_ms", delay, longest / substeps + 1, width)
         frames = math.ceil(round(longest) / substeps) + 1
         self._past = torch.zeros(frames, len(delay), width, device=delay.device)  # newest first
         self._substep = torch.arange(substeps, device=delay.device)[:, None, None]
-        self.arriving = torch.zeros(substeps, len(delay), width, device=delay.device)  # in each substep
+        self.arriving = torch.zeros(substeps, len(delay), width, device=delay.device)  # commands of each substep
 
     def restart(self, mask: Tensor, sent: Tensor) -> None:
-        """Fill the past with ``sent`` (N, width) where ``mask`` (N,) is true."""
+        """Set all past commands to ``sent`` (N, width) where ``mask`` (N,) is true."""
         self._past.copy_(torch.where(mask[:, None], sent, self._past))
 
     def __call__(self, sent: Tensor) -> None:
-        """Fill ``arriving`` for the control step that begins with ``sent`` (N, width)."""
+        """Fill ``arriving`` for the control step with command ``sent`` (N, width)."""
         self._past[1:] = self._past[:-1].clone()
         self._past[0] = sent
         steps, count = torch.round(self._delay / self._step_ms).long(), len(self._substep)
-        # control steps since it was sent, (substeps, N, 1)
+        # age of the arriving command [control steps], (substeps, N, 1)
         age = (steps - self._substep + count - 1).clamp_(min=0) // count
         torch.gather(self._past, 0, age.expand_as(self.arriving), out=self.arriving)
 
 
 def round_delay(delay: Any, step_ms: float) -> Any:
-    """``delay`` [ms], a number or a tensor, rounded to whole simulation steps, a half up."""
+    """``delay`` [ms], a number or a tensor, rounded to whole simulation steps; half steps are rounded up."""
     return (delay / step_ms + 0.5) // 1.0 * step_ms
 
 

@@ -1,4 +1,4 @@
-"""Observations from a task's table of rows. Sizes, noise, scale, delay, history and order all come from the table."""
+"""Observations computed from a task's table of rows, which has their sizes, noise, scale, delay, history and order."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ class Row(NamedTuple):
 
     name: str
     value: Tensor  # (N, size), a buffer that the step writes in place
-    noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
-    # its mirror image: a kind of envs/mirror.py, or a group; None: not stated, so symmetry must be off
+    noise: float = 0.0  # half width of the added uniform noise, in the unit of the value
+    # mirror image: a kind of envs/mirror.py, or a group; None: unknown, so symmetry must be off
     mirror: str | None = None
-    scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
-    measured: bool = False  # it comes from a sensor of the robot, so domain_rand.observation_delay applies to it
-    # For an exported policy, how a robot measures it (legged_mw/deploy/contract.py knows RobotTask's rows by name):
-    sensors: tuple[str, ...] = ()  # names of sensors in the MJCF; their values side by side are the row
+    scale: float | tuple[float, ...] = 1.0  # one number, or one per column; the policy reads scale * (value + noise)
+    measured: bool = False  # a sensor of the robot measures it, so domain_rand.observation_delay applies
+    # How a robot with an exported policy measures it (legged_mw/deploy/contract.py knows RobotTask's rows by name):
+    sensors: tuple[str, ...] = ()  # names of sensors in the MJCF; the row is their values in order
     unit: str = ""
     frame: str = ""
-    history: int = 1  # frames that the policy sees, oldest first; from `observations.history`
-    group: str = ""  # the group that this row contains, if it is one
+    history: int = 1  # number of frames, oldest first; from `observations.history`
+    group: str = ""  # the group that this row contains, or ""
 
     @property
     def size(self) -> int:
-        """Columns of the row in its group."""
+        """Number of columns of the row in its group."""
         return self.value.shape[1] * self.history
 
     def column_scales(self) -> list[float]:
-        """The scale of each column of ``value``. Raises ConfigError unless there is one scale, or one a column."""
+        """The scale of each column of ``value``. Raises ConfigError unless there is one scale, or one per column."""
         size = self.value.shape[1]
         if not isinstance(self.scale, tuple):
             return [float(self.scale)] * size
@@ -51,7 +51,7 @@ class Row(NamedTuple):
 
 
 def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
-    """The table of the method ``observation_rows``, of ``count`` worlds. Raises StepError if it has another form."""
+    """The table that the method ``make_rows`` returns for ``count`` worlds. Raises StepError if its form is wrong."""
     table, where = make_rows(), place_of(make_rows)
     if not isinstance(table, Mapping) or not all(isinstance(rows, list | tuple) and rows for rows in table.values()):
         raise StepError(f"must return group -> list of rows; it returned {type(table).__name__}", where)
@@ -68,7 +68,7 @@ def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
 
 
 class Observations:
-    """The observation groups of N worlds: ``groups[group]`` are its rows, ``buffers[group]`` (N, size) its values."""
+    """The observation groups of N worlds. ``groups[group]``: its rows; ``buffers[group]`` (N, size): its values."""
 
     written = ("_parts",)
 
@@ -81,7 +81,7 @@ class Observations:
         device: str,
         make_delay: Callable[[int], Delay] | None = None,
     ) -> None:
-        """``table`` is that of ``observation_rows``; ``make_delay(width)`` makes the delay of measured rows."""
+        """``table``: from ``observation_rows``; ``make_delay(width)``: makes the delay of measured rows."""
         self.groups: dict[str, list[Row]] = {}
         self.buffers: dict[str, Tensor] = {}
         self._parts: dict[str, _Group] = {}
@@ -97,25 +97,25 @@ class Observations:
             self._parts[group], self.buffers[group] = part, part.buffer
 
     def attach(self, other: Observations, group: str, name: str) -> None:
-        """Add ``group`` of ``other``, Observations of the same worlds, as ``name``; ``compute`` now updates it too."""
+        """Add ``group`` of ``other``, observations of the same worlds, as ``name``. ``compute`` then updates it too."""
         needed = {group}
-        for each in reversed(other.groups):  # a group comes after those that it contains
+        for each in reversed(other.groups):  # a group is after the groups that it contains
             needed |= {row.group for row in other.groups[each] if each in needed}
         self._parts |= {f"{name}/{each}": part for each, part in other._parts.items() if each in needed}
         self.groups[name], self.buffers[name] = other.rows(group), other.buffers[group]
 
     def rows(self, group: str) -> list[Row]:
-        """The rows of ``group`` in order, with those of the groups that it contains."""
+        """The rows of ``group`` in order; a group that it contains is replaced by its rows."""
         plain = [[row] if not row.group or row.history > 1 else self.rows(row.group) for row in self.groups[group]]
         return [row for rows in plain for row in rows]
 
     def compute(self) -> None:
-        """Fill the buffers: rows side by side, plus noise, times scale, delayed, with their history."""
+        """Fill the buffers: concatenate rows, add noise, multiply by the scale, delay, append to the history."""
         for part in self._parts.values():
             part.compute()
 
     def restart(self, mask: Tensor) -> None:
-        """An episode begins where ``mask`` (N,) is true: forget delayed values and frames of the last one."""
+        """Start an episode where ``mask`` (N,) is true: clear delayed values and the history."""
         for part in self._parts.values():
             if part.delay:
                 part.delay.restart(mask)
@@ -123,20 +123,20 @@ class Observations:
                 part.fresh.logical_or_(mask)
 
     def nonfinite(self) -> list[NonFinite]:
-        """The counters of bad values, one a group."""
+        """The counters of invalid values, one per group."""
         return [part.nonfinite for part in self._parts.values()]
 
     def remember(self) -> list[tuple[Tensor, Tensor]]:
-        """All tensors that ``compute`` writes, with copies."""
+        """(tensor, copy) of all tensors that ``compute`` writes."""
         return [(tensor, tensor.clone()) for part in self._parts.values() for tensor in part.memory()]
 
     def recall(self, before: list[tuple[Tensor, Tensor]], mask: Tensor) -> None:
-        """Restore the copies of ``remember`` in the worlds where ``mask`` (N,) is true."""
+        """Restore the copies of ``remember`` where ``mask`` (N,) is true."""
         for tensor, copy in before:
             assign(tensor, mask, copy)
 
     def span(self, group: str, row: str) -> slice:
-        """Columns of ``row`` in ``group``, all frames of it. Raises ConfigError if the group has no such row."""
+        """Columns of all frames of ``row`` in ``group``. Raises ConfigError if the group has no such row."""
         start = 0
         for each in self.groups[group]:
             if each.name == row:
@@ -145,13 +145,13 @@ class Observations:
         raise ConfigError(unknown("observation row", row, [each.name for each in self.groups[group]], f"'{group}'"))
 
     def newest(self, group: str, row: str) -> slice:
-        """Columns of the newest frame of ``row`` in ``group``."""
+        """Columns of the newest frame of ``row`` in ``group``. Raises ConfigError as ``span``."""
         whole = self.span(group, row)
         size = next(each.value.shape[1] for each in self.groups[group] if each.name == row)
         return slice(whole.stop - size, whole.stop)
 
     def _group_row(self, group: str, name: str) -> Row:
-        """The group ``name`` as a row of ``group``: the same noisy sample."""
+        """The group ``name`` as a row of ``group``, with the same noise. Raises ConfigError for an unknown group."""
         if name not in self.buffers:
             place = "the groups that come before it"
             raise ConfigError(f"observation group '{group}': {unknown('group', name, self.buffers, place)}")
@@ -159,7 +159,7 @@ class Observations:
 
 
 class _Group:
-    """One group: how its rows become a buffer."""
+    """One group: computes its buffer from its rows."""
 
     written = ("fresh", "frame", "buffer", "delay", "nonfinite")
 
@@ -174,10 +174,10 @@ class _Group:
         self._measured = torch.tensor([row.measured for row in each], device=device)
         self.delay: Delay | None = None
         self.nonfinite = NonFinite([f"observation row '{row.name}' of '{name}'" for row in each], device)
-        self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
+        self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # the history has no frame of this episode
         self.frame = torch.zeros(num_envs, len(each), device=device)  # the newest frame of each row
         self.buffer = self.frame
-        self.histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, (N, size) in the frame
+        self.histories: list[tuple[Tensor, Tensor]] = []  # views: (N, F, size) of the buffer, (N, size) of the frame
         if any(row.history > 1 for row in rows):
             long = max(rows, key=lambda row: row.size)
             what = f"observations.history of '{long.name}' = {long.history}"
@@ -212,7 +212,7 @@ class _Group:
 
 
 def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCfg.observations]) -> None:
-    """Raise ConfigError for two rows of a name, and for a group or row in the config that does not exist."""
+    """Raise ConfigError for two rows with the same name, and for a group or row in the config that does not exist."""
     names = {group: [row if isinstance(row, str) else row.name for row in rows] for group, rows in table.items()}
     for group, rows in names.items():
         if twice := [name for name in rows if rows.count(name) > 1]:

@@ -14,61 +14,61 @@ from legged_mw.utils.math import assign, maybe_any
 
 
 class Perturbation:
-    """Kicks and pushes of the root in N worlds, as the section ``perturbation`` has them."""
+    """Kicks and pushes of the root in N worlds, by the config section ``perturbation``."""
 
     written = ("_kick", "_clock", "kick_force", "kick_active", "kick_level", "growth", "_push_clock")
 
     def __init__(
         self, cfg: type[RobotTaskCfg.perturbation], sim: Simulation, root_body: int, mass: float, dt: float
     ) -> None:
-        """``mass`` [kg] of the robot, ``dt`` [s] of a control step."""
+        """``mass``: of the robot [kg]; ``dt``: control step [s]."""
         self.cfg, self._sim, self._root, self._mass, self._dt = cfg, sim, root_body, mass, dt
         n, device = sim.num_envs, sim.device
         spans = [cfg.interval, cfg.duration, [-math.pi, math.pi], cfg.velocity]
         self._ranges = torch.tensor(spans, dtype=torch.float, device=device).T.contiguous()  # (2, 4)
         self._kick = torch.zeros(n, 4, device=device)  # pause, duration [control steps], direction [rad], dv [m/s]
-        self._clock = torch.zeros(n, device=device)  # [control steps] since the draw
+        self._clock = torch.zeros(n, device=device)  # time since the draw [control steps]
         self.kick_force = torch.zeros(n, 3, device=device)  # (N, 3) on the root, world frame [N]
         self.kick_active = torch.zeros(n, dtype=torch.bool, device=device)  # (N,)
-        # (N,) share of the range of dv that draws come from
+        # (N,) factor on drawn values of dv
         self.kick_level = torch.full((n,), 0.0 if cfg.curriculum else 1.0, device=device)
-        # () share of dv that ``perturbation.growth`` has reached
+        # () factor on dv by ``perturbation.growth``
         self.growth: Tensor | float = torch.ones((), device=device) if cfg.growth else 1.0
-        self._push_clock = torch.zeros(n, device=device)  # [control steps] to the next push
+        self._push_clock = torch.zeros(n, device=device)  # time to the next push [control steps]
         if cfg.push:
             self._push_clock.uniform_(0.0, cfg.push_interval_s / dt).round_()
 
     def apply(self) -> None:
-        """Disturb the robots in this step."""
+        """Apply the kicks and pushes of this step."""
         if self.cfg.kick:
             self._kick_robots()
         if self.cfg.push:
             self._push_robots()
 
     def anneal(self, done: float) -> None:
-        """Let kicks grow with the share ``done`` (0 to 1) of a training, between the shares ``perturbation.growth``."""
+        """Increase kicks from 0 to full strength while the progress ``done`` is in ``perturbation.growth`` (0 to 1)."""
         if isinstance(self.growth, Tensor):
             self.growth.fill_(float(np.interp(done, self.cfg.growth, [0.0, 1.0])))
 
     def update_level(self, mask: Tensor, survived: Tensor) -> None:
-        """Move levels towards the share ``survived`` (N,) of an episode, where ``mask`` (N,) is true."""
+        """Move levels towards ``survived`` (N,), a share of the episode, where ``mask`` (N,) is true."""
         assign(self.kick_level, mask, torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate))
 
     def statistics(self) -> dict[str, Tensor]:
-        """With a curriculum the kicks' mean level: (2,) a sum and what to divide it by."""
+        """The mean kick level if there is a curriculum, as (2,) sum and count."""
         level = self.kick_level
         mean = torch.stack([level.sum(), torch.full_like(level[0], len(level))])
         return {"kick_level": mean} if self.cfg.curriculum else {}
 
     def reset(self, mask: Tensor) -> None:
-        """An episode begins where ``mask`` (N,) is true."""
+        """Start an episode where ``mask`` (N,) is true."""
         if self.cfg.kick:
             self._redraw(mask)
             self.kick_active.masked_fill_(mask, False)
             self.kick_force.masked_fill_(mask[:, None], 0.0)
 
     def _kick_robots(self) -> None:
-        """Apply a half sine of horizontal force after a pause, then draw the next kick."""
+        """Apply a horizontal half-sine force after a pause, then draw the next kick."""
         wait, steps, angle, speed = self._kick.unbind(dim=1)
         elapsed = self._clock - wait
         self.kick_active.copy_((elapsed >= 0.0) & (elapsed < steps))
@@ -91,7 +91,7 @@ class Perturbation:
         self._clock.masked_fill_(mask, 0.0)
 
     def _push_robots(self) -> None:
-        """Give the root a random horizontal velocity, and angular velocity, where its clock has run down. [L]"""
+        """Set random horizontal and angular velocities of the root where the clock has reached 0. [L]"""
         self._push_clock.sub_(1.0)
         due = self._push_clock <= 0.0
         if maybe_any(due):

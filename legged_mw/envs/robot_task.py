@@ -1,12 +1,12 @@
-"""What every robot does in every task: act, sense, end, reset, observe, be rewarded. Read top to bottom.
+"""The base class of all tasks: actions, state, termination, reset, observations, rewards. Read it top to bottom.
 
-Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no host reads.
-Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on by a number of
-that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are at the end. ``observation_rows`` is
-the table of what the policy sees: the only place that states the layout.
+``_step`` and all that it calls is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no host
+reads. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>`` with a number of the
+same name in ``cfg.rewards.scales``. It returns (N,) and only reads. The terms are at the end of the file.
+``observation_rows`` is the table of the policy's observations, and the only definition of their layout.
 
-Freshness: ``qpos``, ``qvel`` and what is computed from them are current. Sensor values (contacts, places and velocities
-of sites, accelerometer, joint torque) are one simulation step old, and zero in a world just reset.
+Freshness: ``qpos``, ``qvel`` and values computed from them are current. Sensor values (contacts, positions and
+velocities of sites, accelerometer, joint torque) are one simulation step old, and zero in a world that was just reset.
 
 Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym, legged_gym for Unitree's robots;
 [UL] unitree_rl_lab; [I] Isaac Lab; [M] mjlab; [HIM] HIMLoco.
@@ -45,7 +45,7 @@ from legged_mw.utils.errors import ModelError, StepError, place_of, unknown
 from legged_mw.utils.files import find_file
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
-FIELDS = {  # parameter of build_model, or table of it -> the field that it comes from
+FIELDS = {  # parameter or table of build_model -> its config field
     **{name: f"control.{name}" for name in ("stiffness", "damping", "stall_torque", "no_load_speed", "gear")},
     **{name: f"asset.{name}" for name in ("imu_site", "colliders", "held_joints", *PARTIAL)},
     "pose": "init_state.default_joint_angles",
@@ -57,17 +57,18 @@ class RobotTask(BaseTask):
     """N robots in N worlds, as one vectorized environment. A task is a subclass with its rewards and rows."""
 
     cfg: RobotTaskCfg
-    exam = ""  # kind of exam that grades a policy (legged_mw/eval/exams.py); none
-    command_table: tuple[Command, ...] = ()  # commands that a person can give the robot; none
-    commands: Tensor  # (N, C), in the order of command_table; only where that is not empty
-    # reward term -> value that the simulator senses where the term is on; `asset.sense` adds others
+    exam = ""  # kind of exam of a policy (legged_mw/eval/exams.py); "": none
+    command_table: tuple[Command, ...] = ()  # commands of a user to the robot
+    commands: Tensor  # (N, C), in the order of command_table; only if that is not empty
+    # reward term -> sensor that it needs; `asset.sense` adds others
     SENSED_FOR: ClassVar[Mapping[str, str]] = {"self_collision": SELF_CONTACT, "angular_momentum": ANGULAR_MOMENTUM}
 
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
-        """Each line needs those above it.
+        """Make the environment. The order of the lines matters.
 
-        Loading the robot needs its ground and the sensors of its terms; draws need the simulation's fields; buffers are
-        views of the simulation; rows are buffers; each reward term is tried once, so all that it reads must exist.
+        The robot needs its ground and the sensors of the reward terms. Domain randomization needs the simulation's
+        fields. Buffers are views of the simulation, and rows are buffers. Each reward term is called once, so all that
+        it reads must exist.
         """
         self.cfg = cfg
         law = self.motor_law
@@ -89,7 +90,7 @@ class RobotTask(BaseTask):
         )
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.domain_rand = self.remember(DomainRand(cfg, self.robot, self.sim, law))
-        self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
+        self.dt = cfg.sim.dt * cfg.control.decimation  # control step [s]
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_ranges()
         self._init_buffers()
@@ -118,15 +119,15 @@ class RobotTask(BaseTask):
         self.compute_observations()
 
     def _apply_actions(self) -> None:
-        """Motor commands from the actions."""
+        """Compute motor commands from the actions."""
         self.actuators.apply(self.actions)
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
-        """Torques (N, D) [N m] from clipped, delayed ``actions`` (N, D); force limits and curve apply afterwards.
+        """Torques (N, D) [N m] from clipped, delayed ``actions`` (N, D). Force limits and curves apply afterwards.
 
-        It runs only in a class that overrides it, before every simulation step: the override is then the motors' law.
-        Without an override the law is ``control.actuator``, by default MuJoCo's servo (envs/motors.py). This method is
-        legged_gym's position law, for ``super()._compute_torques(actions)``.
+        If a class overrides this method, it is the motor law and is called before every simulation step. Otherwise the
+        law is ``control.actuator``, by default MuJoCo's servo (envs/motors.py), and this method is not called. The body
+        is legged_gym's position law, for ``super()._compute_torques(actions)``.
         """
         target = self.default_dof_pos + self.actuators.scale * actions
         return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
@@ -139,21 +140,21 @@ class RobotTask(BaseTask):
 
     @property
     def p_gains(self) -> Tensor:
-        """``control.stiffness`` as drawn, (D,) or (N, D) [N m/rad]."""
+        """``control.stiffness``, (D,), or (N, D) if it is randomized [N m/rad]."""
         return self.actuators.gain("stiffness")
 
     @property
     def d_gains(self) -> Tensor:
-        """``control.damping`` as drawn, (D,) or (N, D) [N m s/rad]."""
+        """``control.damping``, (D,), or (N, D) if it is randomized [N m s/rad]."""
         return self.actuators.gain("damping")
 
     def _update_state(self) -> None:
-        """Compute once what termination and rewards read."""
+        """Compute the values that termination and rewards share."""
         self._episode_length_buf.add_(1)
         self._refresh_base()
 
     def _refresh_base(self) -> None:
-        """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
+        """Compute joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
         torch.sub(self.dof_pos, self.default_dof_pos, out=self.dof_offset)
         if self.actuators.encoder_offset is not None:
             torch.add(self.dof_offset, self.actuators.encoder_offset, out=self.joint_reading)
@@ -164,7 +165,7 @@ class RobotTask(BaseTask):
         self.base_ang_vel_world.copy_(quat_rotate(quat[:, 0], self.base_ang_vel))
 
     def _end_step(self) -> None:
-        """Keep values for the next step, after the reward has read this step's."""
+        """Store this step's values for the next step, after the reward has read the previous ones."""
         if "action_smoothness" in self.reward_names:
             self.last_last_actions.copy_(self.last_actions)
         if self.last_dof_vel is not None:
@@ -174,7 +175,7 @@ class RobotTask(BaseTask):
     # ---- termination ----------------------------------------------------------------------------------------------
 
     def check_termination(self) -> None:
-        """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
+        """Find episodes that end: by a fall, by a time out, or broken (a state or an action is not finite)."""
         self.broken_worlds.find(self.broken)
         torch.logical_and(self._fallen(), ~self.broken, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
@@ -182,20 +183,20 @@ class RobotTask(BaseTask):
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
 
     def _fallen(self) -> Tensor:
-        """(N,) The robot failed: too tilted, too low, or a part on the ground that must not touch it."""
+        """(N,) Falls: too much tilt, too low, or ground contact of a part that must not touch the ground."""
         return reduce(torch.logical_or, self.fall_rules().values())
 
     def fall_rules(self) -> dict[str, Tensor]:
-        """The causes of a fall, (N,) each, by their config fields."""
+        """Config field of a cause of a fall -> (N,) worlds with this cause."""
         tilt, low = math.cos(math.radians(self.cfg.termination.max_tilt)), self.cfg.termination.min_base_height
-        rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # at 180 degrees never
+        rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # never true for 180 degrees
         if len(self.terminating_contacts):
             touching = self.contact_count[:, self.terminating_contacts]
             rules["asset.terminate_after_contacts_on"] = touching.amax(dim=1) > 0.0
         return {**rules, "termination.min_base_height": self.base_height < low} if low else rules
 
     def _timed_out(self) -> Tensor:
-        """(N,) The episode ends, but not by a failure."""
+        """(N,) Episodes that end without a failure."""
         return self._episode_length_buf >= self.max_episode_length
 
     # ---- resets: masks, never index lists ---------------------------------------------------------------------------
@@ -205,13 +206,13 @@ class RobotTask(BaseTask):
         self.compute_observations()
 
     def reset_envs(self, mask: Tensor) -> None:
-        """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
+        """Start a new episode where ``mask`` (N,) is true. Other worlds do not change, bit for bit."""
         self._update_curricula(mask & (self.episode_steps[:, 0] > 0.0))
         self.sim.reset(mask)
         self.domain_rand.reset(mask)
         self._reset_robots(mask)
         if self.last_dof_vel is not None:
-            assign(self.last_dof_vel, mask, self.dof_vel)  # the first step compares with the start
+            assign(self.last_dof_vel, mask, self.dof_vel)  # for the acceleration of the first step
         self._reset_task(mask)
         self.perturbation.reset(mask)
         self._episode.masked_fill_(mask[:, None], 0.0)
@@ -219,7 +220,7 @@ class RobotTask(BaseTask):
         self._refresh_base()
 
     def restart(self, mask: Tensor) -> None:
-        """Reset the masked worlds between two steps and refresh their observations. Other worlds keep theirs."""
+        """Reset the worlds of ``mask`` (N,) between two steps and update their observations only."""
         before = self.observations.remember()
         self.reset_envs(mask)
         self.fell.masked_fill_(mask, False)
@@ -227,36 +228,36 @@ class RobotTask(BaseTask):
         self.observations.recall(before, ~mask)
 
     def first_observations(self) -> TensorDict:
-        """Observe with empty delays and histories, after a caller changed state or commands."""
+        """Observe with empty delays and histories, after a change of state or commands from outside."""
         self.observations.restart(torch.ones_like(self.reset_buf))
         self.compute_observations()
         return self.get_observations()
 
     def _update_curricula(self, mask: Tensor) -> None:
-        """Make the task harder or easier where ``mask`` (N,) is true: an episode of a step or more ended there."""
+        """Change the difficulty where ``mask`` (N,) is true: an episode of at least one step ended there."""
         if self.cfg.perturbation.curriculum:
             self.perturbation.update_level(mask, self._share_survived())
 
     def on_training_progress(self, share: float) -> None:
-        """Follow a training, of which ``share`` (0 to 1) is done: kicks grow, and terms of a subclass may change."""
+        """Set what depends on the training's progress ``share`` (0 to 1): the kicks, and what a subclass adds."""
         self.perturbation.anneal(share)
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Root near its start, any heading, small velocities; joints and servo targets at or near the default pose."""
+        """Draw root pose and velocity, and joint angles near the default pose. Reset actuators and observations."""
         n = self.num_envs
         draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
         pose = [self._start_places(draw[:, :2]), torch.cos(half), zero, zero, torch.sin(half)]
         assign(self.sim.qpos, mask, torch.cat([*pose, self._start_angles()], dim=1))
-        assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
+        assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # ``sim.reset`` has set joint velocities to zero
         if speed := self.cfg.init_state.dof_vel_range:
             assign(self.dof_vel, mask, torch.empty_like(self.dof_offset).uniform_(-speed, speed))
         self.actuators.reset(mask)
         self.observations.restart(mask)
 
     def _start_angles(self) -> Tensor:
-        """Joint angles of a new episode (N, D) [rad]: the default pose, or drawn around it, within joint ranges."""
+        """Joint angles at the start of an episode (N, D) [rad]: the default pose, or random angles near it."""
         joints, init = self.default_dof_pos.expand(self.num_envs, -1), self.cfg.init_state
         if init.dof_pos_range != [1.0, 1.0]:
             joints = joints * torch.empty_like(self.dof_offset).uniform_(*init.dof_pos_range)
@@ -266,21 +267,21 @@ class RobotTask(BaseTask):
         return joints
 
     def _start_places(self, offset: Tensor) -> Tensor:
-        """The root's place in a new episode, (N, 3) [m, world], ``offset`` (N, 2) [m] away from the middle."""
+        """Root position at the start of an episode (N, 3) [m, world]. ``offset`` (N, 2) [m] is added in x and y."""
         place = self.init_pos.expand(self.num_envs, 3)
         return torch.cat([place[:, :2] + offset, place[:, 2:]], dim=1)
 
     def _reset_task(self, mask: Tensor) -> None:
-        """For subclasses: begin what else the task has, where ``mask`` (N,) is true."""
+        """For subclasses: reset other state of the task where ``mask`` (N,) is true."""
 
     def _share_survived(self) -> Tensor:
-        """(N,) Share of its episode that a robot survived, from 0 to 1."""
+        """(N,) Length of the episode, as a share of the longest, from 0 to 1."""
         return torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
 
     # ---- observations -----------------------------------------------------------------------------------------------
 
     def compute_observations(self) -> None:
-        """Fill ``obs_buf`` as the table says."""
+        """Compute ``obs_buf`` from the table."""
         self.observations.compute()
 
     def _prepare_observations(self) -> None:
@@ -294,19 +295,19 @@ class RobotTask(BaseTask):
         self.obs_buf = self.observations.buffers
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
-        """Rows of each group, in order. A string includes an earlier group.
+        """Group -> its rows, in order. A string includes an earlier group.
 
-        Called once: each value must be a buffer that the step writes in place.
+        It is called once, so each value must be a buffer that the step writes in place.
         """
         return {
             "state": [*self._measured_rows()],
-            "privileged_state": ["state", *self._body_rows(), *self._disturbance_rows()],  # first the same noisy sample
+            "privileged_state": ["state", *self._body_rows(), *self._disturbance_rows()],  # "state" with the same noise
         }
 
     def _measured_rows(self) -> list[Row]:
-        """What a robot measures or estimates of itself, with noise, and its last action."""
+        """Values that a robot measures or estimates, with noise, and its last action."""
         noise = self.cfg.noise.scales
-        return [  # velocity, angular rate and gravity's direction in the body frame, at the IMU
+        return [  # velocity, angular velocity and direction of gravity in the body frame, at the IMU
             Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # [m/s]
             Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro [rad/s]
             Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
@@ -318,7 +319,7 @@ class RobotTask(BaseTask):
         ]
 
     def _body_rows(self) -> list[Row]:
-        """The same without noise, and more that only a simulator knows."""
+        """The same values without noise, and others that only a simulator has."""
         return [
             Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
             Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
@@ -331,7 +332,7 @@ class RobotTask(BaseTask):
         ]
 
     def _disturbance_rows(self) -> list[Row]:
-        """Kicks, and with ``domain_rand.observe`` the drawn numbers, in the config's units."""
+        """Kicks, and with ``domain_rand.observe`` the randomized values, in the units of the config."""
         rand, kick = self.domain_rand, self.perturbation
         drawn = rand.values.items() if self.cfg.domain_rand.observe else ()
         return [
@@ -342,11 +343,11 @@ class RobotTask(BaseTask):
 
     @cached_property
     def mirror(self) -> Mirror:
-        """The mirror image of observations and actions, from the table. The step does not use it."""
+        """The mirror image of observations and actions, made from the table. The step does not use it."""
         return make_mirror(self.observations.groups, self._mirror_blocks(), self.mirror_reach, self.device)
 
     def _mirror_blocks(self) -> dict[str, Block]:
-        """Kinds of mirror image that rows may have, by name."""
+        """Name -> kind of mirror image, for rows."""
         partners = self._partners()
         check_pose(self.robot.joint_names, self.default_dof_pos.tolist(), partners)
         return robot_blocks(partners)
@@ -357,7 +358,7 @@ class RobotTask(BaseTask):
     # ---- reward -----------------------------------------------------------------------------------------------------
 
     def compute_reward(self) -> None:
-        """Sum of scale * term * dt, clipped; ``termination`` is added after the clip. Broken worlds get 0."""
+        """Sum scale * term * dt over the terms, and clip; ``termination`` is added after that. Broken worlds get 0."""
         rewards = self.cfg.rewards
         total = torch.zeros_like(self.rew_buf)
         if self._reward_terms:
@@ -375,7 +376,7 @@ class RobotTask(BaseTask):
         self.episode_steps.add_(1.0)
 
     def _prepare_reward_function(self) -> None:
-        """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
+        """Find the method of each scale and call it once, so that errors appear before training. Raises ConfigError."""
         scales = self._active_scales()
         methods = [name for name in dir(self) if name.startswith("_reward_")]
         terms = {name.removeprefix("_reward_"): getattr(self, name) for name in methods}
@@ -391,56 +392,56 @@ class RobotTask(BaseTask):
         self._reward_terms = [terms[name] for name in self.reward_names]
         bad_terms = self.remember(NonFinite([f"reward term '{name}'" for name in self.reward_names], self.device))
         self.nonfinite = [bad_terms, *self.observations.nonfinite()]
-        # (K,) ``rewards.scales`` times dt, as in legged_gym: a step's reward is this times the term
+        # (K,) ``rewards.scales`` times dt, as in legged_gym: the reward of a step is this times the term
         self.reward_scales = self._tensor([scales[name] for name in self.reward_names]) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = self.remember(Statistics(means, ["episodes", "fell", "broken"], self.device))
 
-    # ---- statistics: summed on the device, read once an iteration ---------------------------------------------------
+    # ---- statistics: summed on the device, read once per iteration --------------------------------------------------
 
     def _sum_statistics(self) -> None:
-        """Add the episodes that end in this step. Runs before the reset."""
+        """Add the episodes that end in this step. Call it before the reset."""
         means = torch.cat([self.episode_sums, self.episode_return, self.episode_steps], dim=1)
         self.statistics.add(self.reset_buf, means, torch.stack([self.reset_buf, self.fell, self.broken], dim=1))
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Present values: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
-        worlds = {"overflowed": self.sim.overflowed_worlds(), **self.broken_worlds.statistics()}  # so far
+        """Name -> current value: () a sum, or (2,) sum and count, so that ranks can be summed."""
+        worlds = {"overflowed": self.sim.overflowed_worlds(), **self.broken_worlds.statistics()}  # totals
         return worlds | self.perturbation.statistics()
 
     def take_statistics(self) -> Tensor:
-        """Sums since the last call, and present values (S,), on the device."""
+        """Sums since the last call and current values (S,), on the device."""
         return self.statistics.take(self._live_statistics())
 
     def name_statistics(self, taken: list[float]) -> dict[str, float]:
-        """Statistics by name, from the vector of ``take_statistics``. Means are NaN if no episode ended.
+        """Name -> statistic, from the vector of ``take_statistics``. Means are NaN if no episode ended.
 
         ``rew_<name>``: mean over episodes of the sum of scale * term * dt, before the clip, divided by
-        ``env.episode_length_s``. ``reward``: the episode's return. ``episode_length`` [control steps].
+        ``env.episode_length_s``. ``reward``: mean return. ``episode_length``: mean length [control steps].
         """
         seconds = self.cfg.env.episode_length_s
         named = self.statistics.name(taken)
         return {name: value / seconds if name.startswith("rew_") else value for name, value in named.items()}
 
     def read_statistics(self) -> dict[str, float]:
-        """Statistics since the last call, by name. Reads the device."""
+        """Name -> statistic since the last call. Waits for the device."""
         return self.name_statistics(self.take_statistics().tolist())
 
     # ---- curricula in a checkpoint ----------------------------------------------------------------------------------
 
     def training_state(self) -> dict[str, Tensor]:
-        """The state of the curricula: tensors, by name."""
+        """Name -> tensor of the curricula's state."""
         return {"kick_level": self.perturbation.kick_level.clone()} if self.cfg.perturbation.curriculum else {}
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from ``training_state`` (of rank 0). If the number of worlds differs, each takes its nearest's."""
+        """Load the ``training_state`` of rank 0. For another number of worlds it is spread over them."""
         if "kick_level" in state and self.cfg.perturbation.curriculum:
             self.perturbation.kick_level.copy_(spread(state["kick_level"], self.num_envs))
 
     # ---- robot and buffers: made here, never rebound ----------------------------------------------------------------
 
     def _make_terrain(self) -> Terrain | None:
-        """The ground; None: a plane."""
+        """The terrain; None: a plane."""
         return None
 
     def _load_robot(self, engine: str) -> RobotModel:
@@ -448,11 +449,11 @@ class RobotTask(BaseTask):
         return load_robot(self.cfg, self.motor_law, engine, self.terrain, *sensed)
 
     def _sensed_geoms(self) -> list[str]:
-        """Geoms whose contacts with the ground are counted: names or patterns."""
+        """Names or patterns of geoms whose ground contacts are counted."""
         return [*self.cfg.asset.penalize_contacts_on, *self.cfg.asset.terminate_after_contacts_on]
 
     def _sensed_sites(self) -> dict[str, list[str]]:
-        """Sites with a velocity sensor -> geoms: a site that the MJCF lacks is made at their lowest point."""
+        """Site with a velocity sensor -> geoms. A site that is not in the MJCF is made at their lowest point."""
         return {}
 
     def _init_buffers(self) -> None:
@@ -469,8 +470,8 @@ class RobotTask(BaseTask):
         actuators = Actuators(self.cfg, law, self.robot, sim, drawn, default, self._compute_torques)
         self.actuators = self.remember(actuators)
         exact = actuators.encoder_offset is None
-        self.joint_reading = self.dof_offset if exact else self.buffer(self.num_actions)  # dof_offset by the encoders
-        self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
+        self.joint_reading = self.dof_offset if exact else self.buffer(self.num_actions)  # measured dof_offset
+        self.base_height = self.root_pos[:, 2]  # height of the root above the ground [m]
         self.fell, self.broken = self.buffer(dtype=torch.bool), self.buffer(dtype=torch.bool)
         broken_worlds = BrokenWorlds(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
         self.broken_worlds = self.remember(broken_worlds)
@@ -489,7 +490,7 @@ class RobotTask(BaseTask):
         self._init_robot_rewards()
 
     def _init_contacts(self) -> None:
-        """Columns of contact_count that ``asset.terminate_after_contacts_on`` and ``penalize_contacts_on`` mean."""
+        """Find the columns of contact_count for ``asset.terminate_after_contacts_on`` and ``penalize_contacts_on``."""
         asset, robot = self.cfg.asset, self.robot
         fall = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
         self.terminating_contacts = torch.tensor(fall, dtype=torch.long, device=self.device)
@@ -502,10 +503,10 @@ class RobotTask(BaseTask):
         table = torch.zeros(self.contact_count.shape[1], len(bodies))
         for column, body in zip(columns, body_of, strict=True):
             table[column, bodies.index(body)] = 1.0
-        self.penalized_contacts = table.to(self.device)  # (C, bodies) 1 where a sensed geom is of a penalised body
+        self.penalized_contacts = table.to(self.device)  # (C, bodies) 1 where a sensed geom belongs to a penalised body
 
     def _contact_columns(self, patterns: list[str], field: str) -> list[int]:
-        """Columns of contact_count. Raises ConfigError for a geom that never touches the ground."""
+        """Columns of contact_count for the geoms of ``patterns``. Raises ConfigError for a geom that cannot collide."""
         asset, robot = self.cfg.asset, self.robot
         meant = robot.names.find(patterns, f"asset.{field}")
         for name in meant:
@@ -515,7 +516,7 @@ class RobotTask(BaseTask):
         return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
 
     def _episode_columns(self) -> dict[str, int]:
-        """State of an episode: name -> width of attributes (N, width) that a reset clears. Subclasses add theirs."""
+        """Name -> width of the attributes (N, width) that a reset sets to 0. Subclasses add theirs."""
         on, joints = self._active_scales(), self.num_actions
         sums = {"episode_sums": len(on), "episode_return": 1, "episode_steps": 1}
         before = {"last_last_actions": joints} if "action_smoothness" in on else {}
@@ -523,28 +524,28 @@ class RobotTask(BaseTask):
 
     last_actions: Tensor  # (N, D)
     last_last_actions: Tensor  # (N, D) a_(t-2); only with `action_smoothness`
-    last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]; only with `dof_acc`
+    last_dof_vel: Tensor | None = None  # (N, D) of the previous step [rad/s]; only with `dof_acc`
     episode_sums: Tensor  # (N, K) scale * term * dt summed over the episode
     episode_return: Tensor  # (N, 1)
-    episode_steps: Tensor  # (N, 1) since the reset; episode_length_buf may start elsewhere
+    episode_steps: Tensor  # (N, 1) steps since the reset; episode_length_buf may start at another value
 
     def _init_ranges(self) -> None:
-        """Numbers of the config as tensors: joints' tables and ranges of a reset."""
+        """Make tensors of the config's tables per joint and of the ranges of a reset."""
         cfg, init = self.cfg, self.cfg.init_state
         self.default_dof_pos = self._tensor(self.robot.pose)
         self.pose_weights = self._tensor(self.robot.tables["rewards.pose_weights"])  # (D,)
         self.deviation_weights = self._tensor(self.robot.tables["rewards.deviation_weights"])  # (D,)
         self.ratings = motor_ratings(cfg, self.robot)
         rated = self.ratings["continuous_torque"]
-        share = 1.0 / max(sum(torque is not None for torque in rated), 1)  # of a rated joint in their mean
+        share = 1.0 / max(sum(torque is not None for torque in rated), 1)  # weight of a rated joint in their mean
         self.heat_weights = self._tensor([share / torque**2 if torque else 0.0 for torque in rated])  # (D,) [1/(N m)^2]
         self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
-        # `soft_dof_pos_limit` of each joint's range, about its middle; infinite where it has no limits
+        # `soft_dof_pos_limit` x range of each joint, about its middle; infinite without limits
         middle = (self.joint_lower + self.joint_upper) / 2
         half = (self.joint_upper - self.joint_lower) / 2 * cfg.rewards.soft_dof_pos_limit
         self.soft_lower = torch.where(half.isfinite(), middle - half, self.joint_lower)
         self.soft_upper = torch.where(half.isfinite(), middle + half, self.joint_upper)
-        self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]
+        self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # root position at reset [m]
         self.init_pos = self._tensor(self.start_place)
         spans = [init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3
         self.reset_range = self._tensor(spans)  # (9,)
@@ -552,19 +553,19 @@ class RobotTask(BaseTask):
     def _tensor(self, values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.float, device=self.device)
 
-    # ---- reward terms, and what the active ones need besides the state ----------------------------------------------
+    # ---- reward terms, and buffers that only some terms need --------------------------------------------------------
 
     def _active_scales(self) -> dict[str, float]:
-        """Terms that are on -> ``rewards.scales``, without dt."""
+        """Active reward term -> its ``rewards.scales``, without dt."""
         return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
 
     def _sensed_on_demand(self) -> list[str]:
-        """Values that active terms or ``asset.sense`` need: of ``SENSORS``, or sensors of the robot's file."""
+        """Sensors that active terms or ``asset.sense`` need: names of ``SENSORS``, or of the robot's file."""
         needed = [sensor for term, sensor in self.SENSED_FOR.items() if term in self._active_scales()]
         return [*needed, *self.cfg.asset.sense]
 
     def sensor(self, name: str) -> Tensor:
-        """(N, size) A view of the sensor ``name``, of ``SENSORS`` or of the robot's file, in the last substep."""
+        """View (N, size) of the sensor ``name``, in ``SENSORS`` or the robot's file. Raises ConfigError without it."""
         if name in SENSORS:
             if name not in self.robot.sensors:
                 raise not_sensed(name)
@@ -581,11 +582,11 @@ class RobotTask(BaseTask):
 
     @property
     def angular_momentum(self) -> Tensor:
-        """(N, 3) Of the whole robot about its centre of mass, world frame [kg m^2/s]."""
+        """(N, 3) Angular momentum of the whole robot about its centre of mass, world frame [kg m^2/s]."""
         return self.sensor(ANGULAR_MOMENTUM)
 
     def _init_robot_rewards(self) -> None:
-        """Allocate what the active terms need besides the state."""
+        """Make the buffers that only active reward terms need. Raises ConfigError if a term lacks something."""
         on, rewards, robot = self._active_scales(), self.cfg.rewards, self.robot
         known = [*SENSORS, *robot.file_sensors]
         for name in self.cfg.asset.sense:
@@ -614,7 +615,7 @@ class RobotTask(BaseTask):
             self.soft_speed = self._tensor(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
 
     def _joints_called(self, wanted: list[str], field: str) -> Tensor:
-        """Indices of the joints that ``wanted`` (patterns or parts of names) means. Held joints are left out."""
+        """Indices of the joints that match ``wanted`` (patterns or parts of names), without held joints."""
         names, held = self.robot.joint_names, self.robot.held
         fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
         for word, found in fits.items():
@@ -754,7 +755,7 @@ def load_robot(
     sites: Mapping[str, Sequence[str]] = {},
     more_sensors: Collection[str] = (),
 ) -> RobotModel:
-    """The robot of ``asset.file`` with the config's joints, contacts and sensors, and motors of ``law``."""
+    """Load the robot of ``asset.file`` with the config's joints, contacts and sensors, and motors of ``law``."""
     asset, on, scale = cfg.asset, cfg.terrain, cfg.control.action_scale
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
@@ -787,17 +788,17 @@ def load_robot(
 
 
 def motor_ratings(cfg: RobotTaskCfg, robot: RobotModel) -> dict[str, list[float | None]]:
-    """The tables of ``cfg.ratings``: name -> (D,), None where unknown. Raises ModelError for a key that fits no joint."""
+    """Table of ``cfg.ratings`` -> values (D,), None if unknown. Raises ModelError for a key that fits no joint."""
     tables = {name: table for name, table in cfg.to_dict()["ratings"].items() if isinstance(table, Mapping)}
     known = {name: some_joints(tables[name], robot.joint_names, f"ratings.{name}", robot.held) for name in tables}
     return {name: [found.get(joint) for joint in robot.joint_names] for name, found in known.items()}
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
-    """x, y, z of the root at reset [m].
+    """Root position at reset [m]: ``init_state.pos`` if the config sets it.
 
-    It is the config's ``init_state.pos``; else the feet are as high as in the keyframe; else the lowest foot is on the
-    ground. Without feet it is the lowest of the ``colliders``.
+    Otherwise x = y = 0, and z is such that the feet are as high as in the keyframe, or without a keyframe the lowest
+    foot is on the ground. For a robot without feet, ``colliders`` take their place.
     """
     if cfg.init_state.pos:
         return list(cfg.init_state.pos)
@@ -811,7 +812,7 @@ def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) 
 
 
 def check_term(method: Callable[[], Any], count: int) -> Tensor:
-    """The value of a reward method. Raises StepError, with the method's place, unless it is (``count``,)."""
+    """The value of a reward method. Raises StepError, with the method's file and line, unless its shape is (count,)."""
     value = method()
     if not isinstance(value, Tensor) or value.shape != (count,):
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
@@ -821,11 +822,11 @@ def check_term(method: Callable[[], Any], count: int) -> Tensor:
 
 
 def require(given: bool, term: str, what: str) -> None:
-    """Refuse an active term that lacks something. A term may call this: each is tried once before training."""
+    """Raise ConfigError for an active term unless ``given``. A term may call it: each is called before training."""
     if not given:
         raise ConfigError(f"rewards.scales.{term} is on, but {what}")
 
 
 def not_sensed(name: str) -> ConfigError:
-    """The error of reading ``name``, which neither a term nor ``asset.sense`` needs."""
+    """The error for reading the sensor ``name`` if neither a term nor ``asset.sense`` needs it."""
     return ConfigError(f"{name} is not sensed; write asset.sense = ['{name}'] in the config")

@@ -245,7 +245,7 @@ class RobotTaskCfg(Config):
         fps: SmallInt = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
     def check(self) -> None:
-        """Raise ConfigError for a value that contradicts another one. Types bound a single value."""
+        """Raise ConfigError for values that contradict each other. Types check single values."""
         self._check_motors()
         length, step = self.env.episode_length_s, self.sim.dt * self.control.decimation
         if length < step:

@@ -1,6 +1,6 @@
-"""Save and restore every tensor of an environment, so that a resumed run continues bit-exactly.
+"""Save and restore all tensors of an environment, so that a resumed run is bit-exact.
 
-The list has the tensors that the task registered by ``buffer`` and ``remember``, and the simulation's own.
+These are the tensors that the task registered with ``buffer`` and ``remember``, and those of the simulation.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.simulation import CONSTANTS_READ
 
-MOST = 1e10  # a state beyond it has blown up for MuJoCo: mjMAXVAL
+MOST = 1e10  # largest valid value of a state: MuJoCo's mjMAXVAL
 _FREE = (
     "rewards",
     "noise",
@@ -25,7 +25,7 @@ _FREE = (
 
 
 def memory(env: RobotTask) -> dict[str, Tensor]:
-    """All tensors that a resumed run restores, by name."""
+    """Name -> tensor, for all tensors that a resumed run restores."""
     return {f"sim.{name}": value for name, value in env.sim.memory().items()} | env.remembered()
 
 
@@ -35,7 +35,7 @@ def take_snapshot(env: RobotTask) -> dict[str, Tensor]:
 
 
 def put_snapshot(env: RobotTask, state: dict[str, Tensor]) -> str:
-    """Restore ``state`` of ``take_snapshot``. Returns '', or why that is impossible; then nothing has changed."""
+    """Restore ``state`` from ``take_snapshot``. If this is not possible, change nothing and return why; else ''."""
     own = memory(env)
     if env.not_remembered:
         return env.not_remembered
@@ -48,7 +48,7 @@ def put_snapshot(env: RobotTask, state: dict[str, Tensor]) -> str:
         for name in fields:
             own[name].copy_(state[name])
         if {name.removeprefix("sim.model.") for name in fields} & {*CONSTANTS_READ}:
-            env.sim.set_constants()  # before the rest: it may touch the state
+            env.sim.set_constants()  # first, because it may change the state
         for name in state.keys() - {*fields}:
             own[name].copy_(state[name])
     return ""
@@ -59,13 +59,13 @@ def _words(value: Tensor | None) -> str:
 
 
 def same_worlds(env: RobotTask) -> dict[str, Any]:
-    """Engine, device and config that must be equal for worlds to go on exactly."""
+    """Engine, device and config, which must be equal for an exact resume."""
     config = {name: section for name, section in env.cfg.to_dict().items() if name not in _FREE}
     return {"engine": env.sim.engine, "device": str(env.device).partition(":")[0], "config": config}
 
 
 def first_difference(there: Any, here: Any, path: str = "") -> str:
-    """``path was A and is B`` of the first value that differs; or ''."""
+    """Text ``PATH was A and is B`` for the first value that differs, or ''."""
     if isinstance(there, dict) and isinstance(here, dict):
         for name in [*here, *(name for name in there if name not in here)]:
             inner = f"{path}.{name}" if path else str(name)
@@ -76,7 +76,7 @@ def first_difference(there: Any, here: Any, path: str = "") -> str:
 
 
 def beyond(saved: dict[str, Tensor], own: dict[str, Tensor]) -> str:
-    """The first name with a number that is not finite or above ``MOST`` in ``saved``, but not in ``own``; or ''."""
+    """The first name with a value not finite or above ``MOST`` in ``saved`` but not in ``own``, or ''."""
     return next((name for name, value in saved.items() if name in own and _sane(own[name]) and not _sane(value)), "")
 
 
@@ -85,7 +85,7 @@ def _sane(value: Tensor) -> bool:
 
 
 def random_state(device: str) -> dict[str, Tensor]:
-    """States of torch's generators of host and device."""
+    """States of torch's random generators on host and device."""
     state = {"cpu": torch.get_rng_state()}
     if device.startswith("cuda"):
         state["cuda"] = torch.cuda.get_rng_state(device)
@@ -93,7 +93,7 @@ def random_state(device: str) -> dict[str, Tensor]:
 
 
 def set_random_state(state: dict[str, Tensor], device: str) -> None:
-    """Restore the generators that ``random_state`` saved."""
+    """Restore the states from ``random_state``."""
     if "cpu" in state:
         torch.set_rng_state(state["cpu"].cpu())
     if "cuda" in state and device.startswith("cuda"):

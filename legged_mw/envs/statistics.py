@@ -1,9 +1,9 @@
-"""What a step counts: means over episodes, values that are not finite, and worlds that broke.
+"""Statistics of the step: means over episodes, values that are not finite, and broken worlds.
 
-Everything is added up on the device, in fixed buffers, and read once an iteration. A reward or an observation that is
-NaN, infinite or very large becomes 0 and is counted; all other values keep their bits. A state that is not finite ends
-an episode as "broken". One broken world is an accident. Many, step after step, mean that the config's physics cannot be
-simulated, and the training must end: ``DivergenceStop`` decides that on the host, once an iteration.
+They are summed on the device, in fixed buffers, and read once per iteration. A reward or an observation that is NaN,
+infinite or very large is replaced by 0 and counted; all other values keep their bits. A state that is not finite ends
+the episode as "broken". A few broken worlds are normal. Many in each iteration mean that the physics of the config
+diverges, and the training must end: ``DivergenceStop`` decides this on the host, once per iteration.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ from torch import Tensor
 
 from legged_mw.sim.simulation import Simulation
 
-Live = Mapping[str, Tensor]  # present values by name: () a sum, or (2,) a sum and what to divide it by
-# [ours: rewards are about 1 and rows, in their units, below 1e5; a mean or variance over 1e5 samples survives it]
+Live = Mapping[str, Tensor]  # name -> current value: () sum, or (2,) sum and count
+# largest valid value [ours: rewards are about 1 and rows below 1e5; means and variances of 1e5 samples stay finite]
 BOUND = 1e6
-SHARE = 0.01  # of an iteration's episodes: if more are broken in two iterations in a row, training ends [ours]
-JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: worlds so far that a joint broke, and that an action did
+SHARE = 0.01  # of the episodes: if more are broken in two successive iterations, the training ends [ours]
+JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: total of worlds broken by a joint, by an action
 
 
 class Statistics:
-    """Means over ended episodes, counts of episodes, and present values: one vector, so that ranks can add theirs."""
+    """Means over ended episodes, counts of episodes, and current values, in one vector that ranks can sum."""
 
     written = ("_sums",)
 
     def __init__(self, means: Sequence[str], counts: Sequence[str], device: str) -> None:
-        """``means`` are divided by the first of ``counts``, the number of episodes that ended."""
+        """``means`` are divided by the first of ``counts``, the number of ended episodes."""
         self.means, self.counts, self.live = list(means), list(counts), dict[str, int]()
         self._sums = torch.zeros(len(self.means) + len(self.counts), device=device)
 
     def add(self, ended: Tensor, means: Tensor, counts: Tensor) -> None:
-        """Add ``means`` (N, M) of the worlds where ``ended`` (N,) is true, and ``counts`` (N, C) of all worlds."""
+        """Add ``means`` (N, M) where ``ended`` (N,) is true, and ``counts`` (N, C) of all worlds."""
         self._sums.add_(torch.cat([torch.where(ended[:, None], means, 0.0), counts], dim=1).sum(dim=0))
 
     def take(self, live: Live) -> Tensor:
-        """All sums as one vector (S,) on the device; the sums of episodes start from zero again."""
+        """All sums as one vector (S,) on the device. Sets the sums over episodes to zero."""
         self.live = {name: value.numel() for name, value in live.items()}
         taken = torch.cat([self._sums, *(value.reshape(-1) for value in live.values())])
         self._sums.zero_()
         return taken
 
     def name(self, taken: Sequence[float]) -> dict[str, float]:
-        """Means, counts and present values by name, from ``take``'s vector. Means are NaN where no episode ended."""
+        """Name -> mean, count or current value, from the vector of ``take``. Means are NaN if no episode ended."""
         values = iter(taken)
         sums = {name: next(values) for name in [*self.means, *self.counts]}
         episodes = sums[self.counts[0]]
@@ -55,69 +55,69 @@ class Statistics:
             total = next(values)
             if size == 1:
                 named[name] = total
-            elif count := next(values):  # a kind of ground that no world is on has no mean level
+            elif count := next(values):  # no mean if the count is 0, as for a kind of ground without a world
                 named[name] = total / count
         return named
 
 
 class NonFinite:
-    """Clears and counts bad values among K named values of N worlds."""
+    """Clears and counts invalid values among K named values of N worlds."""
 
     written = ("counts",)
 
     def __init__(self, names: Sequence[str], device: str) -> None:
-        """``names`` of the K columns, in a user's words."""
+        """``names``: of the K columns, for messages."""
         self.names = list(names)
-        self.counts = torch.zeros(len(self.names), device=device)  # (K,) worlds and steps since ``take``
+        self.counts = torch.zeros(len(self.names), device=device)  # (K,) invalid values since ``take``
 
     def clear(self, values: Tensor) -> None:
-        """Replace each of ``values`` (N, K) that is not finite or beyond BOUND by 0, and count it."""
-        wrong = ~(values.abs() <= BOUND)  # NaN too
+        """Replace ``values`` (N, K) that are not finite or exceed BOUND by 0, and count them."""
+        wrong = ~(values.abs() <= BOUND)  # also True for NaN
         self.counts.add_(wrong.sum(dim=0))
         values.masked_fill_(wrong, 0.0)
 
     def take(self) -> Tensor:
-        """The counts (K,); they start from zero again."""
+        """The counts (K,). Sets them to zero."""
         counts = self.counts.clone()
         self.counts.zero_()
         return counts
 
 
 class BrokenWorlds:
-    """Finds worlds with a state or an action that is not finite, and counts the fastest joint of each."""
+    """Finds worlds with a state or an action that is not finite, and counts the fastest joints of these worlds."""
 
     written = ("counts",)
 
     def __init__(self, sim: Simulation, actions: Tensor, joints: Sequence[str], max_speed: float) -> None:
-        """``actions`` (N, A) is the step's buffer; a faster speed than ``max_speed`` counts as not finite."""
+        """``actions`` (N, A): buffer of the step. Speeds above ``max_speed`` count as not finite."""
         self._sim, self._actions, self._max_speed = sim, actions, max_speed
         self._names = [*(f"{JOINT}{joint}" for joint in joints), ACTION]
-        self.counts = torch.zeros(len(joints) + 1, device=sim.qvel.device)  # worlds by joint, and last by action
+        self.counts = torch.zeros(len(joints) + 1, device=sim.qvel.device)  # worlds broken by each joint, by an action
 
     def find(self, broken: Tensor) -> None:
-        """Write the worlds that broke in this step into ``broken`` (N,), and count why (a NaN speed for no joint)."""
+        """Set ``broken`` (N,) for worlds that broke in this step, and count the causes (no joint for a NaN speed)."""
         speed = self._sim.qvel.abs()
         joints, position = speed[:, 6:], self._sim.qpos.abs().amax(dim=1)
-        action = self._actions.abs().amax(dim=1) < math.inf  # a servo swallows NaN, the reward does not
-        # NaN compares false
+        action = self._actions.abs().amax(dim=1) < math.inf  # a NaN action may reach the reward but not the state
+        # comparisons with NaN are false
         torch.logical_not((speed.amax(dim=1) <= self._max_speed) & (position < math.inf) & action, out=broken)
         fastest = (joints == joints.amax(dim=1, keepdim=True)) & (broken & action)[:, None]
         self.counts.add_(torch.cat([fastest, (broken & ~action)[:, None]], dim=1).sum(dim=0))
 
     def statistics(self) -> dict[str, Tensor]:
-        """Worlds that broke so far, () each, by cause."""
+        """Cause -> total of broken worlds ()."""
         return dict(zip(self._names, self.counts, strict=True))
 
 
 class DivergenceStop:
-    """Decides from an iteration's statistics whether training must end."""
+    """Decides from the statistics of the iterations whether the training must end."""
 
     def __init__(self) -> None:
         self._good: Mapping[str, float] = {}  # statistics of the last iteration with few broken worlds
-        self._before: Mapping[str, float] = {}  # of the last iteration, if it had many
+        self._before: Mapping[str, float] = {}  # statistics of the last iteration if it had many
 
     def verdict(self, numbers: Mapping[str, float]) -> str:
-        """Why training must end; '' to go on. ``numbers`` are an iteration's statistics."""
+        """Why the training must end, or ''. ``numbers``: statistics of an iteration."""
         if not numbers["broken"] > SHARE * numbers["episodes"]:
             self._good, self._before = numbers, {}
             return ""
@@ -131,7 +131,7 @@ class DivergenceStop:
 
 
 def _because(counts: dict[str, float]) -> str:
-    """The cause and what to change, from the worlds that each joint and the actions broke."""
+    """Text on the cause and the remedy. ``counts``: cause -> number of broken worlds."""
     action, total = counts.pop(ACTION, 0.0), sum(counts.values())
     if action > total:
         mend = "lower algorithm.learning_rate, and look for a reward term without a bound"

@@ -1,4 +1,4 @@
-"""The flags of train.py. They are read before torch is imported, so that --help and mistakes answer at once."""
+"""The flags of train.py. They are parsed before the import of torch, so that --help and errors print at once."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
 def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """If ``--task`` is missing, take the task of the run at the path ``--load_run``."""
     if not args.task and args.load_run:
-        from legged_mw.rl.run_folder import task_at  # with torch
+        from legged_mw.rl.run_folder import task_at  # imports torch
 
         args.task = task_at(args.load_run)
     if not args.task:

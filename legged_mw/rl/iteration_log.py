@@ -1,4 +1,4 @@
-"""The log of a training: an iteration's numbers, console, curves, and the check that ends a dead training."""
+"""The log of a training: numbers of an iteration, console, curves, and the check that ends a diverged training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Mark = torch.cuda.Event | float
 
 
 class Clock:
-    """Marks points in the device's queue of work; the time between two marks is known once both are reached."""
+    """Records marks in the device's queue. The time between two marks is known after the device has reached both."""
 
     def __init__(self, device: str) -> None:
         self._device = device if device.startswith("cuda") else None
@@ -49,19 +49,19 @@ class Numbers(NamedTuple):
 
     # sums over all ranks
     statistics: list[float]  # as ``RobotTask.take_statistics``
-    nonfinite: list[float]  # counts of bad values, by name
+    nonfinite: list[float]  # counts of invalid values, by name
     stop: list[float]  # above 0 if a rank must stop
-    iterations_left: list[float]  # that there is time for
-    # of this rank
+    iterations_left: list[float]  # before the deadline
+    # values of this rank
     losses: list[float]
     learning_rate: list[float]
     action_std: list[float]
     undone: list[float]  # 1 if the update was rolled back
-    wrong: list[float]  # 1 where the update read a bad value, by column
+    wrong: list[float]  # 1 for each column with an invalid value in the update
 
 
 class Message:
-    """An iteration's numbers on their way from the device to the host; neither waits for the other."""
+    """An asynchronous copy of an iteration's numbers from the device to the host."""
 
     def __init__(self, **parts: Tensor) -> None:
         """``parts``: a vector for each field of ``Numbers``."""
@@ -73,7 +73,7 @@ class Message:
             self._event.record(torch.cuda.current_stream(values.device))
 
     def read(self) -> Numbers:
-        """The numbers; waits until the device has computed them."""
+        """The numbers. Waits until the device has computed them."""
         if self._event is not None:
             self._event.synchronize()
         parts = self._host.split([*self._sizes.values()])
@@ -81,11 +81,11 @@ class Message:
 
 
 class Report(NamedTuple):
-    """An iteration: the host's own numbers, and those on their way."""
+    """An iteration: numbers known on the host, and the message with the device's numbers."""
 
     iteration: int
-    total_steps: int  # since the beginning of training, over all ranks
-    steps: int  # of this iteration, over all ranks
+    total_steps: int  # steps since the start of the training, over all ranks
+    steps: int  # steps of this iteration, over all ranks
     losses: list[str]  # names
     message: Message
     marks: tuple[Mark, Mark, Mark]  # begin, end of the rollout, end of the update
@@ -100,16 +100,16 @@ class Report(NamedTuple):
 
 _KNOWN = (
     *("reward", "episode_length", "episodes", "fell", "broken", "overflowed", "learning_rate", "action_std"),
-    "walked",  # share of the commanded speed, where a task commands one and a world is told to walk
-    "falls_a_minute",  # of a robot's own time
+    "walked",  # share of the commanded speed, over worlds with a walking command
+    "falls_a_minute",  # per robot and minute of simulated time
 )
-_APART = ("rew_", "broken_by")  # prefixes of numbers that have lines of their own
+_APART = ("rew_", "broken_by")  # prefixes of numbers with separate lines
 
 
 def console_rows(
     numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float
 ) -> dict[str, str]:
-    """Name -> text, of the block of an iteration. A mean over episodes is "-" until one has ended."""
+    """Name -> text for the block of an iteration. A mean over episodes is "-" until an episode has ended."""
 
     def mean(name: str, digits: int) -> str:
         return _number(numbers[name], digits)
@@ -133,7 +133,7 @@ def console_rows(
 def curves(
     numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float, total_steps: int
 ) -> dict[str, float]:
-    """Curve -> value, under rsl-rl's names where it has them."""
+    """Name of a curve -> value. The names are rsl-rl's where it has one."""
     return {
         **{f"Loss/{name}": value for name, value in losses.items()},
         "Loss/learning_rate": numbers["learning_rate"],
@@ -149,13 +149,13 @@ def curves(
         "Episode/fell": numbers["fell"],
         "Episode/broken": numbers["broken"],
         "Train/total_steps": total_steps,
-        "Sim/overflowed_worlds": numbers["overflowed"],  # so far
+        "Sim/overflowed_worlds": numbers["overflowed"],  # total
         **{f"Curriculum/{name}": numbers[name] for name in _of_the_task(numbers)},
     }
 
 
 def _of_the_task(numbers: dict[str, float]) -> list[str]:
-    """Names of the task's own statistics: levels of curricula, and those that its ``_live_statistics`` adds."""
+    """Names of the task's own statistics: curriculum levels and those that ``_live_statistics`` adds."""
     return [name for name in numbers if name not in _KNOWN and not name.startswith(_APART)]
 
 
@@ -164,7 +164,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def quiet_writers() -> None:
-    """Keep TensorBoard's thread from printing its error: the next curve that is written raises it."""
+    """Stop TensorBoard's thread from printing its error. The next write of a curve raises the error."""
     hook = threading.excepthook
 
     def show(died: threading.ExceptHookArgs) -> None:
@@ -177,20 +177,20 @@ def quiet_writers() -> None:
 
 # ---- the console ----------------------------------------------------------------------------------------------------
 
-LOG_FILE = "training.log"  # in the run folder: the blocks of all iterations, also of those before a resume
-_WINDOW = 50  # latest iterations that the remaining time is estimated from: the first ones record and compile
+LOG_FILE = "training.log"  # in the run folder: blocks of all iterations, including those before a resume
+_WINDOW = 50  # last iterations, for the estimate of the remaining time; the first ones record and compile
 
 
 class Console:
-    """Prints a line an iteration, with a progress bar below it on a terminal, and writes blocks to the log file.
+    """Prints one line per iteration, with a progress bar below it on a terminal, and writes blocks to the log file.
 
-    As a context it keeps the bar below the lines that others print. ``listeners`` are called after each iteration with
-    its number, and must not raise.
+    As a context it keeps the bar below all other printed lines. ``listeners`` are called with the number of each
+    finished iteration. They must not raise.
     """
 
     def __init__(self, verbose: bool = False) -> None:
         self.verbose = verbose  # print blocks instead of lines
-        self.deadline: float | None = None  # latest end of the training [s, time.time()]
+        self.deadline: float | None = None  # of the training [s, time.time()]
         self.listeners: list[Callable[[int], None]] = []
         self._file: TextIO | None = None
         self._begun, self._times = time.time(), deque[tuple[int, float]](maxlen=_WINDOW)
@@ -205,7 +205,7 @@ class Console:
     def iteration(
         self, done: int, last: int, exam: int | None, numbers: Mapping[str, float], rows: dict[str, str], speed: float
     ) -> None:
-        """Show the iteration ``done``. ``exam``: the next iteration that ends with one."""
+        """Show the iteration ``done``. ``exam``: the next iteration with an exam."""
         self._times.append((done, time.time()))
         if len(self._times) == 1:
             self._times.appendleft((done - 1, self._begun))
@@ -231,7 +231,7 @@ class Console:
         print(block if self.verbose else line, flush=True)
 
     def _try(self, write: Callable[[], Any]) -> Any:
-        """Go on without the log file if it cannot be written."""
+        """Write to the log file. If that fails, warn and use it no more."""
         try:
             return write()
         except OSError as error:
@@ -240,12 +240,12 @@ class Console:
             return None
 
     def _seconds(self, iterations: int) -> float:
-        """Duration of so many iterations, at the pace of the last ones [s]."""
+        """Estimated duration of ``iterations``, by the last ones [s]."""
         (first, then), (last, now) = self._times[0], self._times[-1]
         return iterations * (now - then) / max(last - first, 1)
 
     def _left(self, done: int, iteration: int) -> float:
-        """Time until the end of ``iteration`` [s]; a training's end, and its exam, come at the deadline at the latest."""
+        """Time until the end of ``iteration`` or the deadline, whichever is first [s]."""
         seconds = self._seconds(iteration - done)
         return min(seconds, max(0.0, self.deadline - time.time())) if self.deadline else seconds
 
@@ -253,7 +253,7 @@ class Console:
         return "" if exam is None or exam <= done else f"{separator}exam in {_clock(self._left(done, exam))}"
 
     def __enter__(self) -> Console:
-        """Begin to train. Lines that are printed from here on push the bar down."""
+        """Start the time of the training, and keep the bar below all lines printed from now on."""
         self._begun = time.time()
         if sys.stdout.isatty() and not self.verbose and os.environ.get("TERM") != "dumb":
             self._out = sys.stdout
@@ -275,7 +275,7 @@ class Console:
             self._drawn = False
 
     def draw(self) -> None:
-        """Draw the bar. The cursor stays at its start, so that any other line replaces it."""
+        """Draw the bar and leave the cursor at its start, so that the next line overwrites it."""
         if self._bar is None or self._out is None:
             return
         done, last, exam = self._bar
@@ -290,7 +290,7 @@ class Console:
 
 
 class _Above:
-    """The terminal's stdout while there is a bar: text goes above it."""
+    """stdout of a terminal with a bar: text is written above the bar."""
 
     def __init__(self, console: Console) -> None:
         assert console._out is not None
@@ -310,7 +310,7 @@ class _Above:
 
 
 def _summary(numbers: Mapping[str, float]) -> str:
-    """What shows that a robot learns. A walk's reward is left out: its sum is clipped at 0, so that it long says nothing."""
+    """Figures of the learning progress, without the reward of walking: its sum is clipped, so it is long near 0."""
     parts = [f"reward {_number(numbers['reward'], 2)}"]
     if "walked" in numbers:
         parts = [f"walks {100.0 * numbers['walked']:.0f}% of the command"]
@@ -326,29 +326,29 @@ def _clock(seconds: float) -> str:
 
 # ---- values that are not finite -------------------------------------------------------------------------------------
 
-IN_A_ROW = 3  # ours: iterations; one bad value is an accident, and the next rollout is another
-# ours: share of a training, not of its first iterations alone; of the command: 17 trainings of 88 to 228 M steps had 0.49
+IN_A_ROW = 3  # ours: iterations; a single invalid value is rare and does not repeat in the next rollout
+# ours: share of the training; iterations; share of the command, which was 0.49 in 17 trainings of 88 to 228 M steps
 QUARTER, BEGUN, WALKS = 0.25, 20, 0.25
-OFTEN = 3.0  # ours: falls a minute, from which on falling is what keeps it from walking
+OFTEN = 3.0  # ours: falls per minute; above it, falls are the reason that a robot does not walk
 
 
 class FiniteCheck:
-    """Warns of values that are not finite, of short episodes and of robots that stand; says when a training must end."""
+    """Warns of values that are not finite, short episodes and robots that stand. Decides when a training must end."""
 
     def __init__(self, names: Sequence[str], stored: Sequence[str]) -> None:
-        """``names`` of the values that the step counts; ``stored``: names of the columns that an update reads."""
+        """``names``: values that the step counts; ``stored``: columns that an update reads."""
         self._names, self._stored = names, stored
-        self.undone = 0  # updates rolled back, in all
+        self.undone = 0  # total of updates rolled back
         self._undone_in_a_row = 0
-        self._bad_in_a_row = 0  # iterations with too many bad values
-        self._iterations = 0  # of this process
-        self._looked = False  # whether it walks
-        self._counts: dict[str, float] = {}  # name -> bad values so far
+        self._bad_in_a_row = 0  # iterations with too many invalid values
+        self._iterations = 0  # iterations of this process
+        self._looked = False  # ``walking`` has made its check
+        self._counts: dict[str, float] = {}  # name -> total of invalid values
 
     def judge(self, counts: Sequence[float], steps: int, undone: bool, wrong: Sequence[float]) -> tuple[list[str], str]:
-        """Warnings, and why training must end, or ''.
+        """Warnings, and the reason why the training must end, or ''.
 
-        ``counts`` of bad values in ``steps`` steps of a world; ``wrong``: 1 for each stored column with a bad value.
+        ``counts``: invalid values in ``steps`` steps of a world; ``wrong``: 1 for each stored column with one.
         """
         found = self._by_name(counts)
         warnings = [line for name, count in found.items() if (line := self._warning(name, count, steps))]
@@ -373,7 +373,7 @@ class FiniteCheck:
         return warnings, ""
 
     def lengths(self, numbers: Mapping[str, float]) -> list[str]:
-        """A warning after the second iteration of this process, if episodes last one step: how they end."""
+        """A warning after the second iteration of this process if episodes last one step, with the causes."""
         self._iterations += 1
         if self._iterations != 2 or not numbers["episodes"] or numbers["episode_length"] > 1.5:
             return []
@@ -385,7 +385,7 @@ class FiniteCheck:
         return [f"{lasted}: unless that is meant, nothing can be learned; --check names the rule that ends them"]
 
     def walking(self, numbers: Mapping[str, float], done: float) -> list[str]:
-        """A warning once, from a quarter of the training on (``done``: its share), if robots that are to walk stand."""
+        """A single warning after a quarter of the training if robots with a walking command stand. ``done``: 0 to 1."""
         walked = numbers.get("walked", math.nan)
         if self._looked or done < QUARTER or self._iterations < BEGUN or math.isnan(walked):
             return []
@@ -405,7 +405,7 @@ class FiniteCheck:
         return [f"{said}; {advice}{slowly}, or train longer"]
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
-        """Name -> count above 0; of a row with several columns, the largest."""
+        """Name -> count, without zeros. For a row with several columns it is the largest count."""
         found: dict[str, float] = {}
         for name, count in zip(self._names, counts, strict=True):
             if count:
@@ -413,7 +413,7 @@ class FiniteCheck:
         return found
 
     def _warning(self, name: str, count: float, steps: int) -> str:
-        """A line when a name is first found, and each time that the total has one digit more."""
+        """A warning for the first invalid value of a name, and again when the total gets one more digit."""
         before = self._counts.get(name, 0.0)
         total = self._counts[name] = before + count
         if before and len(str(int(before))) == len(str(int(total))):

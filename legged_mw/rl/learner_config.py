@@ -35,10 +35,10 @@ from legged_mw.utils.task import LoadedTask
 if TYPE_CHECKING:
     from legged_mw.envs.robot_task import RobotTask
 
-MAX_RATE = 1e-2  # that rsl-rl's adaptive learning rate goes up to
+MAX_RATE = 1e-2  # upper bound of rsl-rl's adaptive learning rate
 Iterations = Annotated[int, at_least(0, 1_000_000)]
 Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
-Sizes = Annotated[list[Count], SOME]  # of layers
+Sizes = Annotated[list[Count], SOME]  # of hidden layers
 FolderPart = Annotated[
     str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))
 ]
@@ -228,7 +228,7 @@ class LeggedRobotCfgPPO(RobotTaskCfgPPO):
 
 
 def fit_cpu(task: LoadedTask, cores: int) -> None:
-    """Set what the section ``cpu`` of the learner's config says, for ``cores`` cores."""
+    """Apply the section ``cpu`` of the learner's config, for ``cores`` cores."""
     train, few = task.train, task.train.cpu
     task.cfg.env.num_envs = min(task.cfg.env.num_envs, few.envs_per_core * cores)
     train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
@@ -241,13 +241,13 @@ def fit_cpu(task: LoadedTask, cores: int) -> None:
         task.set(path, value, where="cpu.overrides")
 
 
-# ---- as rsl-rl takes it ---------------------------------------------------------------------------------------------
+# ---- the form that rsl-rl takes -------------------------------------------------------------------------------------
 
 
 def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[str, Any]:
-    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError.
+    """The learner's config as rsl-rl's flat dict: a deep copy, because rsl-rl writes into it. Raises ConfigError.
 
-    ``env`` has the rows that ``actor.estimator`` names; without one there is no estimator.
+    ``env``: needed only if ``actor.estimator`` or ``actor.concurrent`` is set.
     """
     check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
@@ -270,7 +270,7 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[st
 
 
 def _check_bound(algorithm: dict[str, Any]) -> None:
-    """Drop ``max_learning_rate`` if it is rsl-rl's own; raise ConfigError if no class would read it."""
+    """Remove ``max_learning_rate`` if it is rsl-rl's default. Raises ConfigError if no class would use it."""
     if algorithm["max_learning_rate"] == MAX_RATE:
         del algorithm["max_learning_rate"]
         return
@@ -294,7 +294,7 @@ def _check_bound(algorithm: dict[str, Any]) -> None:
 # ---- classes --------------------------------------------------------------------------------------------------------
 
 
-# As strings, ``module:name``: a task that is only loaded, or listed, waits for no import of rsl-rl.
+# Strings ``module:name``, so that loading or listing tasks does not import rsl-rl.
 _PPO = "rsl_rl.algorithms.ppo:PPO"
 _RNN = "rsl_rl.models.rnn_model:RNNModel"
 _NETWORKS = ("rsl_rl.models.mlp_model:MLPModel", "rsl_rl.models.cnn_model:CNNModel", _RNN)
@@ -314,21 +314,21 @@ ALLOWED: dict[str, tuple[str, ...]] = {
         "rsl_rl.algorithms.distillation:Distillation",
     ),
 }
-_RECURRENT = "legged_mw.rl.students.recurrent:RecurrentModel"  # takes the place of rsl-rl's RNNModel
-# the field of section `actor` that selects it -> the network, imported when it is selected
+_RECURRENT = "legged_mw.rl.students.recurrent:RecurrentModel"  # replaces rsl-rl's RNNModel
+# field of section `actor` that selects a network -> network, imported only if selected
 _ESTIMATOR, _CONCURRENT = "actor.estimator.targets", "actor.concurrent.groups"
 _STUDENTS = {
     _ESTIMATOR: "legged_mw.rl.students.estimator:EstimatingModel",
     _CONCURRENT: "legged_mw.rl.students.concurrent:ConcurrentModel",
 }
-_IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls what these keys name
+_IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls the values of these keys
 
 
 def check_classes(cfg: Config) -> None:
-    """Raise ConfigError for a class that neither the task's own Python file nor ``ALLOWED`` names. Imports nothing.
+    """Raise ConfigError for a class that is neither in the task's Python file nor in ``ALLOWED``. Imports nothing.
 
-    rsl-rl imports and calls the value of ``class_name``, and a run folder may be a stranger's: its config.yaml must not
-    choose code.
+    rsl-rl imports and calls the value of ``class_name``. A run folder may come from a stranger, so its config.yaml must
+    not choose code.
     """
     for network in ("actor", "critic"):
         _check_distribution(cfg.to_dict().get(network, {}).get("distribution_cfg"), f"{network}.distribution_cfg")
@@ -346,10 +346,10 @@ def check_classes(cfg: Config) -> None:
 
 
 def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool = True) -> dict[str, Any]:
-    """Section ``actor`` as rsl-rl takes it, with the class that its subsections select. Raises ConfigError.
+    """Section ``actor`` in rsl-rl's form, with the class that its subsections select. Raises ConfigError.
 
-    ``sections``: the learner's config. ``learns``: False for an actor that only acts, in worlds that may lack the rows
-    it learned from.
+    ``sections``: the learner's config. ``learns``: False for an actor that only acts; ``env`` may then lack the rows
+    that only learning needs.
     """
     actor = {name: value for name, value in sections["actor"].items() if name not in ("estimator", "concurrent")}
     parts = sections["actor"]
@@ -370,9 +370,9 @@ def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool
 
 
 def network_section(section: dict[str, Any]) -> dict[str, Any]:
-    """The section of a network as rsl-rl takes it; without the fields ``rnn_...`` if its class has none.
+    """The section of a network in rsl-rl's form, without the fields ``rnn_...`` if its class has none.
 
-    Imports the class: check it first.
+    It imports the class, so call ``check_classes`` first.
     """
     from rsl_rl.utils import resolve_class
 
@@ -383,7 +383,7 @@ def network_section(section: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
-    """Raise ConfigError if a distribution of rsl-rl does not take all fields of its section."""
+    """Raise ConfigError if a section has fields that its distribution of rsl-rl does not take."""
     name = (section or {}).get("class_name")
     for kind in (*_DISTRIBUTIONS, _BETA):
         if section is None or name not in spellings(kind):
@@ -400,7 +400,7 @@ def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
 
 
 def spellings(kind: str) -> list[str]:
-    """All names by which rsl-rl finds the class ``module:name``, the shortest first."""
+    """All names by which rsl-rl finds the class ``module:name``, shortest first."""
     module, name = kind.split(":")
     long = [f"{module}:{name}", f"{module}.{name}"]
     if not module.startswith("rsl_rl."):
@@ -410,7 +410,7 @@ def spellings(kind: str) -> list[str]:
 
 
 def _class_names(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted path, value) of each class that nested mappings and lists name."""
+    """(dotted path, value) of each class name in nested mappings and lists."""
     items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
     for key, value in items:
         here = f"{path}.{key}" if path else str(key)
@@ -426,7 +426,7 @@ _FLOAT = 4  # [byte]
 
 
 def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> None:
-    """Raise UserError if networks and rollout do not fit the memory; it names the largest field.
+    """Raise UserError, with the largest field, if networks and rollout do not fit the memory.
 
     ``sections``: the learner's config. ``learns``: False for an actor that only acts.
     """
@@ -442,20 +442,20 @@ def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) ->
     value = sections
     for part in field.split("."):
         value = value[part]
-    copies = 4 if learns else 1  # weights, gradients, and Adam's two moments
+    copies = 4 if learns else 1  # weights, gradients, two moments of Adam
     require_memory(
         _FLOAT * copies * sum(counts.values()), device, f"{field} = {value}", "fewer values a layer need less"
     )
     if learns:
         steps, worlds = sections["runner"]["num_steps_per_env"], env.num_envs
-        # action, mean, deviation; reward, done, value, return, advantage
+        # action, mean, std; reward, done, value, return, advantage
         sample = sum(sizes.values()) + 3 * env.num_actions + 5
         what = f"runner.num_steps_per_env = {steps} with env.num_envs = {worlds}"
         require_memory(_FLOAT * steps * worlds * sample, device, what, "fewer steps or worlds need less")
 
 
 def _weights(sections: dict[str, Any], name: str, seen: int) -> dict[str, int]:
-    """Field -> number of weights, of the network ``name`` with ``seen`` inputs."""
+    """Field -> number of weights of the network ``name`` with ``seen`` inputs."""
     section, counts = sections[name], {}
     if "RNN" in section["class_name"]:
         hidden = section["rnn_hidden_dim"]

@@ -1,6 +1,6 @@
-"""The networks of a recorded learner: its layers, and what stands beside an MLP, a regression or a memory.
+"""The networks of a recorded learner: layers, and the interfaces of networks with a regression or a hidden state.
 
-Layers have the same values and gradients as torch's own, in fewer and larger kernels.
+Layers compute the same values and gradients as torch's, with fewer and larger kernels.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from torch import Tensor, nn
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.utils.opaque import fast
 
-Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each
+Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each layer
 FUSED_ON = ["cuda"]  # devices on which updates use fast/kernels.py
-_SUM_ROWS = 128  # rows that one thread sums; threads run side by side
+_SUM_ROWS = 128  # rows that one thread sums, in parallel with others
 
 
 class Linear(torch.autograd.Function):
-    """``x W^T + b`` for many rows, faster than torch's own in two ways.
+    """``x W^T + b`` for many rows, faster than torch's layer for two reasons.
 
-    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns
-    than the weight, of zeros: a multiple of four of them is what TF32 products want.
+    The bias gradient is summed in two passes; torch's single pass uses only a small part of a GPU. ``x`` may have more
+    columns than the weight, with zeros, because TF32 products are faster with a multiple of four columns.
     """
 
     @staticmethod
@@ -46,23 +46,23 @@ class Linear(torch.autograd.Function):
 
 
 def kernels_for(x: Tensor) -> Any:
-    """The module fast/kernels.py if it is there and ``x`` is on a device that uses it, else None."""
+    """The module fast/kernels.py if it exists and the device of ``x`` uses it, else None."""
     if x.device.type not in FUSED_ON:
         return None
-    return fast("kernels")  # imports warp, which takes a second
+    return fast("kernels")  # imports warp, in about 1 s
 
 
 def sum_rows(x: Tensor) -> Tensor:
-    """Sum over the rows of ``x`` (B, size), in two passes."""
+    """Sum over the rows of ``x`` (B, size), computed in two passes."""
     return x.view(-1, math.gcd(len(x), _SUM_ROWS), x.shape[1]).sum(dim=1).sum(dim=0)
 
 
 class EluLayers(torch.autograd.Function):
-    """Linear layers with an ELU after each but the last, whose input and output are float32.
+    """Linear layers with an ELU after each but the last. Input and output are float32.
 
-    ``read``: weight and bias of each as the products read them: their own, or rounded to bfloat16, in which all before
-    the last is then computed; sums and the gradients of weights are float32 all the same. ``x`` and the first weight
-    may have more columns, of zeros.
+    ``read``: weight and bias of each layer for the products, either the parameters or copies in bfloat16. With copies,
+    all layers but the last compute in bfloat16; sums and the weights' gradients are float32 in both cases. ``x`` and
+    the first weight may have additional columns of zeros.
     """
 
     @staticmethod
@@ -94,10 +94,10 @@ class EluLayers(torch.autograd.Function):
 
 
 class EluBackward:
-    """Gradients before the ELUs of a network from those after them, and their sums over rows; on a GPU one kernel."""
+    """Backward pass of the ELUs of a network, with sums of the gradients over rows; on a GPU one kernel per ELU."""
 
     def __init__(self, outs: list[Tensor]) -> None:
-        """``outs``: (B, size) of each ELU."""
+        """``outs``: output (B, size) of each ELU."""
         self._outs, sizes = outs, [out.shape[1] for out in outs]
         self._sums: list[Tensor] = [outs[0]] * len(outs) if outs else []
         self._table: Tensor | None = None
@@ -106,7 +106,7 @@ class EluBackward:
             self._table = outs[0].new_empty(-(-rows // self._kernels.ROWS), sum(sizes), dtype=torch.float32)
 
     def __call__(self, grad: Tensor, i: int) -> Tensor:
-        """The gradient (B, size) before ELU ``i``, of the type of its output."""
+        """The gradient (B, size) with respect to the input of ELU ``i``, in the dtype of its output."""
         if self._table is not None:
             return self._kernels.elu_backward(
                 grad, self._outs[i], self._table, sum(out.shape[1] for out in self._outs[:i])
@@ -117,14 +117,14 @@ class EluBackward:
         return grad
 
     def sums(self) -> list[Tensor]:
-        """The sums (size,) by layer, float32 at least. Call it after all layers."""
+        """The sums (size,) of each layer, at least float32. Call it after all layers."""
         if self._table is None:
             return self._sums
         return list(self._table.sum(dim=0).split([out.shape[1] for out in self._outs]))
 
 
 def _float_product(a: Tensor, b: Tensor) -> Tensor:
-    """``a @ b``; for bfloat16 the result is float32, in which the product sums anyway."""
+    """``a @ b``; for bfloat16 the result is float32, the dtype in which the product sums."""
     if a.dtype != torch.bfloat16:
         return a @ b
     if a.is_cuda:
@@ -133,9 +133,9 @@ def _float_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def elu_layers(layers: nn.Module) -> list[nn.Linear]:
-    """The linear layers of an rsl-rl MLP if ``EluLayers`` can compute them, else none.
+    """The linear layers of an rsl-rl MLP if ``EluLayers`` can compute them, else [].
 
-    Layers without parameters may follow the last one.
+    Layers without parameters may follow the last linear layer.
     """
     every: list[nn.Module] = [*layers]  # type: ignore[misc]
     linear = [layer for layer in every if isinstance(layer, nn.Linear)]
@@ -146,7 +146,7 @@ def elu_layers(layers: nn.Module) -> list[nn.Linear]:
 
 
 def run_mlp(layers: nn.Module, x: Tensor, read: Layers | None = None) -> Tensor:
-    """The output of an rsl-rl MLP for inputs (B, size); ``read``: the weights for ``EluLayers``, if not its own."""
+    """The output of an rsl-rl MLP for inputs (B, size). ``read``: weights for ``EluLayers``; None: the parameters."""
     rest = [*layers]  # type: ignore[misc]
     if linear := elu_layers(layers):
         with torch.no_grad():
@@ -166,9 +166,9 @@ def _padded(weight: Tensor, columns: int) -> Tensor:
 
 
 class HalfWeights:
-    """A network's weights in bfloat16 for ``EluLayers``: copies of all but the last layer's."""
+    """Copies of a network's weights in bfloat16 for ``EluLayers``, except the last layer's."""
 
-    ALIGNED = 8  # products of bfloat16 want a multiple of so many columns
+    ALIGNED = 8  # bfloat16 products are faster with a multiple of this number of columns
 
     def __init__(self, linear: list[nn.Linear]) -> None:
         hidden = linear[:-1]
@@ -184,27 +184,27 @@ class HalfWeights:
 
     @torch.no_grad()
     def read(self) -> Layers:
-        """The layers, rounded from their present weights."""
+        """The layers, rounded from the current weights."""
         self._copies[0].copy_(self._own[0])
         torch._foreach_copy_(self._copies[1:], self._own[1:])  # pyright: ignore[reportPrivateImportUsage]
         return self._layers
 
     @torch.no_grad()
     def prepare(self, latent: Tensor) -> Tensor:
-        """The network's input (B, size), in bfloat16 and padded with columns of zeros."""
+        """The network's input (B, size) in bfloat16, padded with zero columns."""
         return nn.functional.pad(latent.bfloat16(), (0, -latent.shape[1] % self.ALIGNED))
 
 
 def sample(model: MLPModel, output: Tensor) -> Tensor:
-    """Actions (N, A) drawn from a Gaussian policy. torch.normal would read the std on the host."""
+    """Sample actions (N, A) of a Gaussian policy without torch.normal, which reads the std on the host."""
     assert model.distribution is not None
-    model.distribution.update(output)  # the forward pass without its own sample
+    model.distribution.update(output)  # the forward pass without its sample
     mean = model.output_mean
     return mean + model.output_std * torch.randn_like(mean)
 
 
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:
-    """Update rsl-rl's running mean and variance with ``x`` (B, size), in place, without its copy from the host."""
+    """Update rsl-rl's running mean and variance with ``x`` (B, size) in place, without a copy from the host."""
     if not normalizer.training:
         return
     count = x.shape[0] * world_size
@@ -224,44 +224,44 @@ def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size:
     normalizer._std.copy_(normalizer._var.sqrt())
 
 
-# ---- networks that are more than an MLP -----------------------------------------------------------------------------
+# ---- networks with a regression or a hidden state -------------------------------------------------------------------
 
 
-# Inputs of a recurrent network in an update; only its memory knows the parts.
+# Inputs of a recurrent network in an update; only its Memory reads the parts.
 Sequenced = tuple[Tensor, ...]
 
 
 class RegressingModel(MLPModel):
-    """rsl-rl's MLPModel whose input is, in part, the output of an ``estimator``, which learns by regression.
+    """rsl-rl's MLPModel with an ``estimator``, which learns by regression and gives a part of the MLP's input.
 
-    rl/students/ holds such networks. A learner knows none of them by name.
+    The subclasses are in rl/students/. A learner does not import them.
     """
 
     field: str  # the config field that selects the model
     regression: str  # the name of the regression loss
     estimator: nn.Module
-    learning_rate: float  # of the estimator
+    learning_rate: float  # learning rate of the estimator
 
     @staticmethod
     def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-        """Constructor arguments beyond MLPModel's, see ``actor_settings``. Raises ConfigError."""
+        """Additional constructor arguments, see ``actor_settings``. Raises ConfigError."""
         raise NotImplementedError
 
     def rollout_latent(self, obs: TensorDict) -> Tensor:
-        """The MLP's input (N, size) during the rollout, of all worlds in order."""
+        """The MLP's input (N, size) in the rollout, one row per world in order."""
         return self.get_latent(obs)
 
     def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """Inputs and targets of the regression, the same in all epochs of an update.
+        """Inputs and targets of the regression, for all epochs of an update.
 
-        ``obs`` (S * B,) come from ``worlds`` (B,); S is 2 if mirror images follow them, else 1.
+        ``obs`` (S * B,): observations of ``worlds`` (B,), followed by their mirror images if S is 2.
         """
         raise NotImplementedError
 
     def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """The network's output for ``latent``, which may be padded with zeros, and the regression loss ().
 
-        The loss has no gradient for the parameters that the output depends on.
+        The loss has no gradient with respect to parameters that the output depends on.
         """
         raise NotImplementedError
 
@@ -271,9 +271,9 @@ class RegressingModel(MLPModel):
 
 
 def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
-    """Parameters by part, of policy, critic and estimator if there is one, and the estimator's learning rate ().
+    """Parameters of the parts policy, critic and, if it exists, estimator; and the estimator's learning rate ().
 
-    The gradients of a part are clipped together.
+    Gradients are clipped by the norm of each part.
     """
     if not isinstance(actor, RegressingModel):
         return [[*actor.parameters()], [*critic.parameters()]], []
@@ -283,13 +283,13 @@ def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Param
 
 
 class Memory(Protocol):
-    """The hidden state of a recurrent network in each of N worlds, in tensors that stay."""
+    """The hidden states of a recurrent network in N worlds, in fixed tensors."""
 
-    now: Tensor  # (states, S, N, H): S is 2 if mirror images have a state of their own, else 1
-    start: Tensor  # the same at the start of the rollout
+    now: Tensor  # (states, S, N, H): S is 2 if mirror images have separate states, else 1
+    start: Tensor  # ``now`` at the start of the rollout
 
     def advance(self, obs: Any) -> Tensor:
-        """Take in observations (N,), or (2N,) with their mirror images; returns the MLP's input (N, H)."""
+        """Update with observations (N,), or (2N,) with mirror images. Returns the MLP's input (N, H)."""
         ...
 
     def normalised(self, obs: Any) -> Tensor:
@@ -300,34 +300,34 @@ class Memory(Protocol):
         """Set the state to 0 where ``ended`` (N,)."""
 
     def for_rsl_rl(self) -> Any:
-        """A copy of the state in rsl-rl's form."""
+        """A copy of the hidden state in rsl-rl's form."""
 
     def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequenced:
-        """The rollout of ``worlds`` (B,), from ``inputs`` (S * T * B, size) and ``dones`` (T, N, 1) after each step."""
+        """The rollout of ``worlds`` (B,): ``inputs`` (S * T * B, size), and ``dones`` (T, N, 1) after each step."""
         ...
 
     def unroll(self, sequence: Sequenced) -> Tensor:
-        """The MLP's inputs (S * T * B, H) over a sequence, with gradients."""
+        """The MLP's inputs (S * T * B, H) for a sequence, with gradients."""
         ...
 
 
 class RememberingModel(RNNModel):
-    """rsl-rl's recurrent network; a recorded learner keeps its hidden state."""
+    """rsl-rl's recurrent network. A recorded learner stores its hidden state."""
 
     def memory(self, worlds: int, images: int, device: str) -> Memory:
-        """An empty memory; with ``images`` 2 it has a second state, which has seen mirror images only."""
+        """A memory of zeros. With ``images`` 2 it has a second state, updated with mirror images only."""
         raise NotImplementedError
 
 
 class Memories(dict[nn.Module, Memory]):
-    """Network -> memory, of the recurrent networks among ``models``."""
+    """Network -> memory, for the recurrent networks among ``models``."""
 
     def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
         remembering = [model for model in models if isinstance(model, RememberingModel)]
         super().__init__({model: model.memory(worlds, images, device) for model in remembering})
 
     def begin_rollout(self) -> None:
-        """Keep the present states as the start of the rollout."""
+        """Store the current states as the start of the rollout."""
         for memory in self.values():
             memory.start.copy_(memory.now)
 

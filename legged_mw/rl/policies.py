@@ -1,4 +1,4 @@
-"""Trained policies on disk: finding one, loading its actor from a checkpoint or an exported network, learning from it."""
+"""Trained policies on disk: find one, load its actor from a checkpoint or an export, distil it or start from it."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from legged_mw.utils.errors import printable, shown, unknown
 from legged_mw.utils.files import check_folder, finish_moving, typed
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
-NETWORK_FILE = "policy.onnx"  # of an export: legged_mw.deploy, which imports nothing from here, calls it so too
+NETWORK_FILE = "policy.onnx"  # in an export; legged_mw.deploy defines the same name, since it does not import rl
 MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "state_in", "state_out", "estimate"
-PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
+PREFIX = "policy."  # prefix of the weights' names in the file: the attribute of ExportedPolicy
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
-LEARNING_ONLY = "teacher."  # parameters that are not needed to act
-# not needed for a mean action or an estimate
+LEARNING_ONLY = "teacher."  # prefix of parameters that acting does not need
+# prefixes of parameters that a mean action and an estimate do not need
 UNWRITTEN = (
     "distribution.",
     LEARNING_ONLY,
@@ -55,9 +55,9 @@ UNWRITTEN = (
 class PolicySource(NamedTuple):
     """The files of a policy."""
 
-    folder: Path  # holds its config
-    checkpoint: Path  # of a run, or the network of an export
-    shipped: bool  # it came with this package
+    folder: Path  # with its config
+    checkpoint: Path  # checkpoint of a run, or network of an export
+    shipped: bool  # part of this package
 
     def results(self, task: LoadedTask) -> Path:
         """The folder for pictures and reports of the policy."""
@@ -67,7 +67,7 @@ class PolicySource(NamedTuple):
 def find_policy(
     task: LoadedTask, run: str | None = None, checkpoint: int = -1, experiment: str | None = None
 ) -> PolicySource:
-    """The named run or export, else the last run, else the policy that ships with the task."""
+    """The named run or export, else the latest run, else the policy that ships with the task."""
     folder = experiment_folder(task, experiment)
     if run == "shipped":
         return shipped_policy(task, "--load_run shipped: ")
@@ -77,7 +77,7 @@ def find_policy(
 
 
 class Trained(NamedTuple):
-    """A policy of another run, and its task as it was trained."""
+    """A policy of another run, and its task with the config of its training."""
 
     source: PolicySource
     task: LoadedTask
@@ -88,7 +88,7 @@ def find_trained(
 ) -> Trained:
     """The policy that a flag names: a file, a run of ``experiment`` or at a path, an export, a task, or TASK/RUN.
 
-    Its task is one of the project, or in a file that the task of the ``learner`` is or extends.
+    Its task must be one of the project, or the file of the ``learner``'s task or of one that it extends.
     """
     path, (task, _, run) = typed(name), name.partition("/")
     try:
@@ -106,7 +106,7 @@ def find_trained(
 
 
 def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> PolicySource:
-    """The policy that ``--compare`` names; it must be of the same task."""
+    """The policy that ``--compare`` names. Raises ConfigError if it is of another task."""
     if run == "shipped":
         return shipped_policy(task, "--compare shipped: ")
     rival = _run_or_export(experiment_folder(task, experiment), run)
@@ -121,7 +121,7 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Pol
 def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> PolicySource:
     """A run by its name or path, or an export by its path."""
     folder = typed(name)
-    finish_moving(folder)  # of an export that was killed
+    finish_moving(folder)  # of an export whose process was killed
     if (folder / NETWORK_FILE).is_file():
         return PolicySource(check_folder(folder), folder / NETWORK_FILE, shipped=False)
     found = find_run(experiment, name)
@@ -129,7 +129,7 @@ def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> PolicyS
 
 
 def shipped_policy(task: LoadedTask, flag: str) -> PolicySource:
-    """The policy that ships with the task. The ConfigError begins with ``flag`` and lists the policies that ship."""
+    """The policy that ships with the task. Raises ConfigError, whose text starts with ``flag``, if there is none."""
     folder = ROOT / "resources" / "policies" / task.name
     if not (folder / NETWORK_FILE).is_file():
         there = ", ".join(sorted(path.parent.name for path in folder.parent.glob(f"*/{NETWORK_FILE}")))
@@ -138,14 +138,14 @@ def shipped_policy(task: LoadedTask, flag: str) -> PolicySource:
 
 
 def load_trained(name: str, source: PolicySource) -> LoadedTask:
-    """The task called ``name`` with the config that the policy was trained with."""
+    """The task ``name`` with the config of the policy's training."""
     task, config = load_task(name), source.folder / CONFIG_FILE
     update_from_run(task, load_yaml(config), where=shown(config))
     return task
 
 
 def introduce(source: PolicySource, changes: dict[str, tuple[Any, Any]]) -> None:
-    """Print the policy, and changes of the config that it was trained with."""
+    """Print the policy and the changes to the config of its training."""
     print(f"{'shipped policy' if source.shipped else 'policy'}: {shown(source.checkpoint)}")
     for path, (before, now) in sorted(changes.items()):
         print(printable(f"  {path}: {before} -> {now}"))
@@ -154,8 +154,8 @@ def introduce(source: PolicySource, changes: dict[str, tuple[Any, Any]]) -> None
 def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPModel:
     """The actor in a checkpoint or a ``policy.onnx``: ``policy(obs)`` is its mean action (N, A) in ``env``.
 
-    ``cfg`` is the learner's config. Raises ConfigError if the file cannot be read, its networks are not those of the
-    config, or the config names a class that it may not.
+    ``cfg``: the learner's config. Raises ConfigError if the file cannot be read, its networks do not fit the config, or
+    the config names a class that is not allowed.
     """
     actor_class, actor_cfg = resolve_class(acting(cfg, env))
     actor = actor_class(env.get_observations(), cfg.to_dict()["obs_groups"], "actor", env.num_actions, **actor_cfg).to(
@@ -166,10 +166,9 @@ def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPMode
 
 
 def acting(cfg: Config, env: RobotTask, read: list[str] | None = None) -> dict[str, Any]:
-    """Section ``actor`` as rsl-rl takes it, for an actor that only acts in ``env``. Raises ConfigError.
+    """Section ``actor`` in rsl-rl's form, for an actor that does not learn. Raises ConfigError.
 
-    ``cfg``: the learner's config. ``read``: the observation groups in ``env``, if they have other names than in the
-    config.
+    ``cfg``: the learner's config. ``read``: the actor's observation groups in ``env``, if not those of the config.
     """
     check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
@@ -180,7 +179,7 @@ def acting(cfg: Config, env: RobotTask, read: list[str] | None = None) -> dict[s
 
 
 def read_actor(path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:
-    """The parameters of ``model`` in a checkpoint, of PPO or a student, or in a ``policy.onnx``. Raises ConfigError."""
+    """The parameters of ``model`` in a checkpoint of PPO or distillation, or a ``policy.onnx``. Raises ConfigError."""
     if path.suffix != ".onnx":
         return actor_in(load_tensors(path, str(next(model.parameters()).device)), path, model, what)
     check_fit(saved := read_parameters(path, model), model.state_dict(), path, what)
@@ -206,9 +205,9 @@ def act(policy: MLPModel, obs: TensorDict) -> Tensor:
 
 
 def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
-    """The parameters of ``policy`` by name from the export at ``path``, bit for bit.
+    """Name -> parameter of ``policy`` in the export at ``path``, bit for bit.
 
-    The file holds no noise of exploration, count or variance of the normaliser: ``policy`` keeps its own.
+    Exploration noise and the normaliser's count and variance are not in the file, so they come from ``policy``.
     """
     import onnx
     from onnx import numpy_helper
@@ -220,7 +219,7 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
         }
     except FileNotFoundError:
         raise ConfigError(f"no policy at {path}") from None
-    except Exception:  # protobuf's or onnx's
+    except Exception:  # errors of protobuf and onnx
         raise ConfigError(f"{path} cannot be read as an ONNX network: it is damaged") from None
     found = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
     if not found:
@@ -235,9 +234,9 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
 
 
 def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
-    """std + eps of the normaliser, found by its place, as torch's exporter chooses its name: (obs - mean) / divisor.
+    """std + eps of the normaliser: the divisor in (obs - mean) / divisor. torch's exporter does not keep its name.
 
-    Subtracting eps and adding it again gives the same float32, as the value is such a rounded sum.
+    The value is a rounded sum, so subtracting eps and adding it again gives the same float32.
     """
     centred = [node.output[0] for node in graph.node if PREFIX + MEAN in node.input]
     for node in graph.node:
@@ -249,17 +248,17 @@ def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
 # ---- learning from a policy of another run: as a student of a teacher, or as a warm start ---------------------------
 
 
-TEACHER = "teacher"  # the observation group of a teacher, and its folder in a student's run
-# count of samples of an exported normaliser, which the file does not hold [ours: as most have seen]
+TEACHER = "teacher"  # the teacher's observation group, and its folder in a student's run
+# sample count of an exported normaliser, which the file does not hold [ours: typical of a training]
 _EXPORTED_COUNT = 10**8
 
-# Fields that must be equal, or an action or a row would mean something else. Not every task has them.
+# Fields that must be equal, because they define the meaning of an action or a row. Not every task has them.
 _SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "gait.offsets")
 _SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
 
 
 def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
-    """Change rsl-rl's ``settings`` for a warm start, or for a student whose ``teacher`` is this network."""
+    """Change rsl-rl's ``settings`` for a warm start, or for distillation from the network ``teacher``."""
     distillation, start = cfg.to_dict()["distillation"], cfg.warm_start
     settings["critic_warmup"] = start.critic_warmup if start.policy and not teacher else 0
     noise = settings["actor"].get("distribution_cfg", {})
@@ -279,13 +278,13 @@ def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any
 
 
 def attach_teacher_observations(env: RobotTask, teacher: Trained) -> None:
-    """Add the teacher's observation group to ``env``. Raises ConfigError if its actions mean something else here."""
+    """Add the teacher's observation group to ``env``. Raises ConfigError if its actions have another meaning here."""
     env.observations.attach(_observe(env, teacher, "the teacher"), TEACHER, TEACHER)
     env.first_observations()
 
 
 def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
-    """Load the teacher's parameters into ``model``. Raises ConfigError if ``env`` gives another number of inputs."""
+    """Load the teacher's parameters into ``model``. Raises ConfigError if the number of inputs differs in ``env``."""
     path = teacher.source.checkpoint
     try:
         model.load_state_dict(read_actor(path, model, TEACHER))
@@ -295,7 +294,7 @@ def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
 
 
 def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
-    """Raise ConfigError if ``policy`` reads other rows than the actor of ``task``, or acts by another convention."""
+    """Raise ConfigError unless rows and actions of ``policy`` have the same meaning as those of ``task``'s actor."""
     theirs = _observe(env, policy, "the policy to begin with").rows(TEACHER)
     ours = [row for group in task.train.obs_groups.actor for row in env.observations.rows(group)]
     if [*map(_layout, theirs)] != [*map(_layout, ours)]:
@@ -306,7 +305,7 @@ def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
 
 
 def begin_with(model: MLPModel, policy: Trained) -> None:
-    """Load the actor's parameters into ``model``, which keeps its own noise."""
+    """Load the actor's parameters into ``model``, except its exploration noise. Raises ConfigError."""
     path, own = policy.source.checkpoint, model.state_dict()
     if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
         raise ConfigError(
@@ -322,18 +321,18 @@ def begin_with(model: MLPModel, policy: Trained) -> None:
 
 
 def keep_teacher(teacher: Trained, run: Path) -> None:
-    """Copy the teacher into the student's run folder: a resume needs it even if the teacher's run is gone."""
+    """Copy the teacher into the student's run folder, so that a resume does not need the teacher's run."""
     folder = run / TEACHER
     if not folder.exists():
         folder.mkdir()
         save_yaml(folder / CONFIG_FILE, teacher.task.to_dict())
-        file = teacher.source.checkpoint  # of any name; a resumed run looks for one of these
+        file = teacher.source.checkpoint  # with any name; a resumed run expects one of the names below
         known = file.name if file in checkpoints(file.parent).values() else "model_0.pt"
         shutil.copy(file, folder / (NETWORK_FILE if file.suffix == ".onnx" else known))
 
 
 def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
-    """The policy's observations in ``env``, as the group TEACHER. Raises ConfigError if a meaning differs."""
+    """The policy's observations in ``env``, as group TEACHER. Raises ConfigError if a meaning differs."""
     task, kind = policy.task, _class_in(env, policy.task.env_class)
     found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
     if kind:
@@ -341,7 +340,7 @@ def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
             seen = _observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
             if not (found := _differences(env, task.cfg, seen.rows(TEACHER))):
                 return seen
-        except ConfigError as error:  # a row that needs a sensor which is missing here
+        except ConfigError as error:  # a row needs a sensor that is missing here
             found = [str(error)]
     raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
 
@@ -350,11 +349,11 @@ def _layout(row: Row) -> tuple[str, int, int, list[float]]:
     return row.name, row.value.shape[1], row.history, row.column_scales()
 
 
-# ---- a policy of another task in this one: what it reads here, and why its actions may mean something else ----------
+# ---- a policy of another task in this one: its observations, and differences in the meaning of its actions ----------
 
 
 def _class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
-    """``kind`` among the classes of ``env``, by name and file: a task's file may have been imported twice."""
+    """The class ``kind`` among those of ``env``, by name and file, because a task's file may be imported twice."""
     return next(
         (
             each
@@ -368,12 +367,12 @@ def _class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
 def _observe_as(
     env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str
 ) -> Observations:
-    """Observations of ``env`` as those of a ``kind`` with the config ``cfg``; the group ``name`` joins ``groups``.
+    """The observations of a ``kind`` with config ``cfg``, computed in ``env``. Group ``name`` concatenates ``groups``.
 
-    They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for
-    a group that the table does not have.
+    They have no noise and no delay, so the policy's actions are not noisy either. Raises ConfigError for a group that
+    the table does not have.
     """
-    table = kind.observation_rows(_as_on_a_plane(env, cfg))  # the rows go by the section noise and others
+    table = kind.observation_rows(_as_on_a_plane(env, cfg))  # the rows depend on section noise and others
     for group in groups:
         if group not in table:
             raise ConfigError(unknown("observation group", group, table, kind.__name__))
@@ -392,7 +391,7 @@ def _in_words(rows: Iterable[Row]) -> str:
 
 
 def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
-    """Each difference, in words, by which a policy of ``cfg`` with these ``rows`` means something else in ``env``."""
+    """Texts of the differences that give actions or ``rows`` of a policy of ``cfg`` another meaning in ``env``."""
     kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
     found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
     there, here = (
@@ -425,14 +424,14 @@ def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list
 
 
 def _as_on_a_plane(env: RobotTask, cfg: RobotTaskCfg) -> RobotTask:
-    """A shallow copy of ``env`` with another config, to read only: it shares the tensors."""
+    """A shallow, read-only copy of ``env`` with another config and no terrain. It shares the tensors."""
     other = copy.copy(env)
     other.cfg, other.terrain = cfg, None
     return other
 
 
 def _field(cfg: RobotTaskCfg, path: str) -> Any:
-    """A field by its path; None if the task has no such field."""
+    """The config field at a dotted path, or None if the task does not have it."""
     value: Any = cfg
     for name in path.split("."):
         value = getattr(value, name, None)
@@ -444,7 +443,7 @@ def _differ(what: str, there: Any, here: Any) -> str:
 
 
 def _joint(what: str, names: Sequence[str], there: Sequence[float], here: Sequence[float], unit: str) -> str:
-    """The first joint that differs."""
+    """Text on the first joint whose values differ, or ''."""
     for name, theirs, ours in zip(names, there, here, strict=True):
         if abs(theirs - ours) > 1e-6:
             return f"{what} of joint {name} is {theirs:g}{unit} there and {ours:g}{unit} here"
@@ -452,5 +451,5 @@ def _joint(what: str, names: Sequence[str], there: Sequence[float], here: Sequen
 
 
 def _few(names: Sequence[str]) -> str:
-    """The first three names and how many there are."""
+    """Up to three names, then the number of names if there are more."""
     return f"{', '.join(names[:3])} ... ({len(names)})" if len(names) > 3 else ", ".join(names)

@@ -1,10 +1,10 @@
-"""rsl-rl's PPO recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no read from the device.
+"""rsl-rl's PPO recorded as CUDA graphs: the same config keys, mathematics and checkpoints, without device-host syncs.
 
 Acting, the returns and the whole update (all epochs and minibatches: forward, loss, backward, clipping, learning rate,
-Adam) are one graph each. A graph remembers addresses, so tensors that rsl-rl rebinds every iteration (advantages, the
-normalisers' std) are copied into tensors that stay. Actor and critic share no parameter, so they run side by side.
+Adam) are one graph each. A graph reads fixed addresses, so tensors that rsl-rl rebinds every iteration (advantages, the
+normalisers' std) are copied into fixed tensors. Actor and critic share no parameters, so they run in parallel.
 
-On a CPU the same code runs unrecorded. It prepares each minibatch once, not once an epoch.
+On a CPU the same code runs without a graph. Each minibatch is prepared once per update, not once per epoch.
 """
 
 from __future__ import annotations
@@ -46,30 +46,30 @@ from legged_mw.rl.networks import (
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
-_MIN_RATE, _RATE_STEP = 1e-5, 1.5  # of the adaptive learning rate, as in rsl-rl
+_MIN_RATE, _RATE_STEP = 1e-5, 1.5  # adaptive learning rate: lowest value, factor per change; as in rsl-rl
 
 
 class Recorded:
-    """First parent of a recorded learner. The second, rsl-rl's algorithm, does everything if not ``graphed``."""
+    """First base class of a recorded learner. The second is rsl-rl's algorithm, which runs alone if not ``graphed``."""
 
     graphed: bool
     learning_rate: float
     optimizer: Any
     device: str
-    _rates: Sequence[Tensor | float]  # of the optimizer's groups
+    _rates: Sequence[Tensor | float]  # learning rate of each optimizer group
     _memories: Memories
 
     def _begin(self) -> None:
-        """Make the fixed tensors, and graphs to be recorded at their next calls."""
+        """Make the fixed tensors, and the graphs, which are recorded in later calls."""
         raise NotImplementedError
 
     def release(self) -> None:
-        """Drop the recorded graphs: NCCL does not close a connection that a CUDA graph still uses."""
+        """Delete the recorded graphs: NCCL does not close a connection that a CUDA graph still uses."""
         if self.graphed:
             self._begin()
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
-        """Store the transition, and clear the memories of worlds whose episode ended."""
+        """Store the transition, and clear the hidden states of worlds whose episode ended."""
         super().process_env_step(obs, rewards, dones, extras)  # type: ignore[misc]
         if self.graphed:
             self._memories.forget(dones)
@@ -83,7 +83,7 @@ class Recorded:
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Load a checkpoint of this class or of rsl-rl's own; distillation also takes its teacher from one of PPO."""
+        """Load a checkpoint of this class or of rsl-rl. Distillation also loads its teacher from a PPO checkpoint."""
         iteration = super().load(loaded_dict, load_cfg, strict)  # type: ignore[misc]
         if self.graphed:
             make_recordable(self.optimizer, self._rates, str(self.device))
@@ -92,7 +92,7 @@ class Recorded:
 
 
 def why_stock(learner: Any, policy: MLPModel, other: MLPModel, regressing: MLPModel) -> str | None:
-    """Why a learner of two networks cannot be recorded, or None. Only ``regressing`` may be a RegressingModel."""
+    """Why a learner with two networks cannot be recorded, or None. Only ``regressing`` may be a RegressingModel."""
     for network in (policy, other):
         known = type(network) is MLPModel or isinstance(network, RememberingModel)
         if not known and not (network is regressing and isinstance(network, RegressingModel)):
@@ -107,28 +107,28 @@ def why_stock(learner: Any, policy: MLPModel, other: MLPModel, regressing: MLPMo
 
 
 class Minibatch(NamedTuple):
-    """Samples of an update, and the inputs of the networks."""
+    """One minibatch: its samples and the inputs of the networks."""
 
     batch: RolloutStorage.Batch
-    actor_input: Tensor | Sequenced  # (B, size), normalised; a sequence for a network with a memory
+    actor_input: Tensor | Sequenced  # (B, size), normalised; a sequence for a recurrent network
     critic_input: Tensor | Sequenced
-    regression_batch: tuple[Tensor, ...] = ()  # of the actor's estimator
+    regression_batch: tuple[Tensor, ...] = ()  # for the actor's estimator
 
 
 class GraphedPPO(Recorded, PPO):
     """PPO whose acting and update are replayed CUDA graphs.
 
-    Minibatches are drawn from samples, or from whole worlds if a network has a memory (RNNModel). The first three
-    updates run eagerly and the fourth is recorded, so none is wasted on warming up. rsl-rl's own update runs instead,
-    and a line says so, with a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed precision,
-    an optimizer other than Adam or AdamW, or a distribution that is not Gaussian.
+    A minibatch holds random samples, or whole worlds if a network is recurrent (RNNModel). The first three updates run
+    without a graph and the fourth is recorded, so no update is lost to warm-up. In these cases rsl-rl's own update runs
+    and a message says so: a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed precision,
+    an optimizer other than Adam or AdamW, a distribution that is not Gaussian.
     """
 
-    critic_only = False  # during the warm-up of a warm start: the actor does not learn
+    critic_only = False  # True during the critic's warm-up: the actor does not learn
     half = False  # see ``learn_in_half``
-    _bound: float | None  # on the adaptive learning rate, if the config sets one
+    _bound: float | None  # upper bound of the adaptive learning rate, or None
     _plain_rate: float  # the learning rate, if not graphed
-    _rate: Tensor | None = None  # the learning rate () if graphed, float64 like rsl-rl's Python number
+    _rate: Tensor | None = None  # the learning rate () if graphed; float64 like rsl-rl's Python number
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
         self._recurrent = actor.is_recurrent or critic.is_recurrent
@@ -138,7 +138,7 @@ class GraphedPPO(Recorded, PPO):
         self.graphed = reason is None
         if self._recurrent:
             _check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
-            self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
+            self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl rejects it for recurrent networks
         if reason:
             if self._bound:
                 raise ConfigError(
@@ -154,7 +154,7 @@ class GraphedPPO(Recorded, PPO):
         groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
         self.optimizer = type(self.optimizer)(groups)
         make_recordable(self.optimizer, self._rates, str(self.device))
-        # cuDNN wants the weights of its own layers in its own order
+        # cuDNN requires its own order of the weights of recurrent layers
         flat = [] if self._recurrent else enumerate(self._parts)
         self._adams = [FlatAdam(self.optimizer, max(0, i - 1), part, self.max_grad_norm) for i, part in flat]
         self.rollback = UpdateRollback(self, (self.actor, self.critic))
@@ -171,8 +171,8 @@ class GraphedPPO(Recorded, PPO):
     def _begin(self) -> None:
         st, device = self.storage, self.device
         drawn = st.num_envs if self._recurrent else st.num_envs * st.num_transitions_per_env
-        self._share = drawn // self.num_mini_batches  # worlds or samples a minibatch
-        self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # samples a minibatch
+        self._share = drawn // self.num_mini_batches  # worlds or samples per minibatch
+        self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # samples per minibatch
         first = {name: value[0].clone() for name, value in st.observations.items()}
         self._obs = TensorDict(first, [st.num_envs], device=device)
         # the world of each transition
@@ -194,10 +194,10 @@ class GraphedPPO(Recorded, PPO):
         )
 
     def learn_critic_only(self, on: bool) -> None:
-        """From the next update on, train the critic only, or both networks again.
+        """From the next update on, train the critic only (``on``) or both networks.
 
-        When both learn again, an adaptive learning rate begins at its lowest, so that the actor unlearns nothing;
-        within an update it has risen to where it belongs.
+        When the actor starts to learn again, an adaptive learning rate starts at its lowest value, so that the actor
+        does not forget. The rate rises to its usual value within one update.
         """
         if on != self.critic_only:
             self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
@@ -205,10 +205,10 @@ class GraphedPPO(Recorded, PPO):
                 self.learning_rate = _MIN_RATE
 
     def learn_in_half(self) -> None:
-        """Compute the hidden layers of plain networks of ELUs in bfloat16, from now on.
+        """Compute the hidden layers of MLPs with ELU in bfloat16, from now on.
 
-        Acting too, or the policy that learns would differ from the one that acted. Weights and their gradients, the
-        last layer, sums and losses stay float32.
+        This includes acting: the update must compute the same policy as the rollout. Weights, their gradients, the last
+        layer, sums and losses stay float32.
         """
         torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction = False
         self.half = True
@@ -216,7 +216,7 @@ class GraphedPPO(Recorded, PPO):
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
-        """Launch the body on a second stream, beside the code after it, until ``_meet``."""
+        """Run the body on a second CUDA stream, in parallel with the code after it until ``_meet``."""
         if self._side is None:
             yield
             return
@@ -231,7 +231,7 @@ class GraphedPPO(Recorded, PPO):
     # ---- the rollout ----------------------------------------------------------------------------------------------
 
     def act(self, obs: TensorDict) -> Tensor:
-        """Sampled actions (N, A); the transition keeps values and distribution until ``process_env_step``."""
+        """Sample actions (N, A). ``transition`` holds values and distribution until ``process_env_step``."""
         if not self.graphed:
             return super().act(obs)
         if self.storage.step == 0:
@@ -260,7 +260,7 @@ class GraphedPPO(Recorded, PPO):
         return self._forward(model, self._half[model].prepare(latent)) if model in self._half else model.mlp(latent)
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
-        """The MLP's input. A memory takes in ``seen``: the observations, with mirror images if it learns from them."""
+        """The MLP's input. ``seen``: the observations; for a recurrent network with symmetry also mirror images."""
         if model in self._memories:
             return self._memories[model].advance(seen)
         return model.rollout_latent(self._obs) if isinstance(model, RegressingModel) else model.get_latent(self._obs)
@@ -276,7 +276,7 @@ class GraphedPPO(Recorded, PPO):
 
     def _compute_returns(self) -> None:
         memory = self._memories.get(self.critic)
-        # rsl-rl steps the critic once more: on a copy of the memory
+        # rsl-rl's method steps the critic, so it gets a copy of the hidden state
         self.critic.reset(hidden_state=memory.for_rsl_rl() if memory else None)
         super().compute_returns(self._obs)
         self.critic.reset()
@@ -285,11 +285,11 @@ class GraphedPPO(Recorded, PPO):
     # ---- the update -----------------------------------------------------------------------------------------------
 
     def update(self) -> dict[str, Any]:
-        """Learn from the storage; returns mean losses as tensors ()."""
+        """Run one update on the storage. Returns the mean losses as tensors ()."""
         if not self.graphed:
             return super().update()
-        torch.randperm(len(self._order), out=self._order)  # one for all epochs, as in rsl-rl
-        self._entropy_coef.fill_(self.entropy_coef)  # these two may be changed between updates
+        torch.randperm(len(self._order), out=self._order)  # one permutation for all epochs, as in rsl-rl
+        self._entropy_coef.fill_(self.entropy_coef)  # these two may change between updates
         self._desired_kl.fill_(self.desired_kl or 0.0)
         self._update_graph()
         self.storage.clear()
@@ -308,7 +308,7 @@ class GraphedPPO(Recorded, PPO):
         self.rollback.finish(self._losses)
 
     def _prepare(self, indices: Tensor) -> Minibatch:
-        """Gather what all epochs share: samples and their mirror images, normalised inputs, advantages."""
+        """Gather the data that all epochs use: samples and their mirror images, normalised inputs, advantages."""
         st = self.storage
 
         def take(stored: Any) -> Tensor:
@@ -340,7 +340,7 @@ class GraphedPPO(Recorded, PPO):
 
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequenced:
-        """The network's normalised input, padded with columns of zeros to a multiple of four or eight."""
+        """The network's normalised input, padded with zero columns to a multiple of four or eight."""
         memory = self._memories.get(model)
         latent = memory.normalised(obs) if memory else model.get_latent(obs)
         if model in self._half:
@@ -357,16 +357,16 @@ class GraphedPPO(Recorded, PPO):
             clip = self.clip_param if self.use_clipped_value_loss else 0.0
             of_values, of_critic = value_loss(values.detach(), batch, clip, self.value_loss_coef)
             values.backward(of_values)
-        with torch.set_grad_enabled(not self.critic_only):  # an actor that does not learn needs no graph
+        with torch.set_grad_enabled(not self.critic_only):  # no autograd graph for an actor that does not learn
             if isinstance(self.actor, RegressingModel) and isinstance(actor_input, Tensor):
                 output, *regression = self.actor.learn(actor_input, regression_batch)
             else:
                 output, regression = self._forward(self.actor, actor_input), []
             gradients, parts, kl = self._policy_loss(batch, output)
         if self.critic_only:
-            kl = None  # it is rounding noise: the actor did not move
+            kl = None  # the actor did not change, so the KL is rounding noise
         else:
-            gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # reaches the estimator only
+            gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # affects the estimator only
             wanted = [(value, gradient) for value, gradient in gradients if value.requires_grad]
             torch.autograd.backward(*zip(*wanted, strict=True))  # type: ignore[arg-type]
         self._meet()
@@ -395,7 +395,7 @@ class GraphedPPO(Recorded, PPO):
         return run_mlp(model.mlp, inputs, self._half[model].read() if model in self._half else None)
 
     def _step(self, kl: Tensor | None) -> None:
-        """Adapt the rate to ``kl``, clip each part's gradient, and step. Several ranks take the means of both."""
+        """Adapt the rate to ``kl``, clip each part's gradient, and step. KL and gradients are means over all ranks."""
         adams, gradients = self._adams, [adam.gradient() for adam in self._adams]
         if not adams:
             gradients = [p.grad for group in self.optimizer.param_groups for p in group["params"]]
@@ -412,7 +412,7 @@ class GraphedPPO(Recorded, PPO):
             self.optimizer.step()
 
     def _average_over_ranks(self, parts: list[Tensor]) -> None:
-        """Replace ``parts`` by their means over all ranks, in one message."""
+        """Replace ``parts`` by their means over all ranks, with one all_reduce."""
         message = torch.cat([part.flatten() for part in parts])
         torch.distributed.all_reduce(message)
         message /= self.gpu_world_size
@@ -421,7 +421,7 @@ class GraphedPPO(Recorded, PPO):
             part.copy_(mean.view_as(part))
 
     def _adapt_rate(self, kl: Tensor) -> None:
-        """rsl-rl's rule: lower the rate if the KL is above twice ``desired_kl``, raise it if it is below half."""
+        """rsl-rl's rule: lower the rate if KL > 2 ``desired_kl``, raise it if KL < ``desired_kl`` / 2."""
         assert self._rate is not None
         highest = self._bound or MAX_RATE
         if kernels := kernels_for(kl):
@@ -445,12 +445,12 @@ class GraphedPPO(Recorded, PPO):
             self.actor.update_regression_normalizer(obs, self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
-        """Mean square distance of the policy from its mirror image."""
+        """Mean squared difference between the actions for mirrored observations and the mirrored actions."""
         symmetry, size = self.symmetry, self._size
         assert symmetry is not None
         if not self._recurrent and (symmetry.use_mirror_loss or not symmetry.use_data_augmentation):
-            return symmetry.compute_loss(self.actor, copy.copy(batch), size)  # a copy: it adds mirror images
-        # an augmented batch holds the mirror images, and the forward pass is made
+            return symmetry.compute_loss(self.actor, copy.copy(batch), size)  # a copy, because it adds mirror images
+        # an augmented batch already holds the mirror images and their outputs
         means = self.actor.output_mean
         _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
@@ -458,7 +458,7 @@ class GraphedPPO(Recorded, PPO):
     # ---- the learning rate ------------------------------------------------------------------------------------------
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Load a checkpoint; clip its learning rate to the bound."""
+        """Load a checkpoint and clip its learning rate to the bound."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self._bound:
             self.learning_rate = min(self.learning_rate, self._bound)
@@ -466,12 +466,12 @@ class GraphedPPO(Recorded, PPO):
 
     @property
     def rate(self) -> Tensor:
-        """The learning rate () as a tensor: getting it does not wait for the device."""
+        """The learning rate () as a tensor. Reading it does not wait for the device."""
         return torch.tensor(self._plain_rate) if self._rate is None else self._rate
 
     @property
     def learning_rate(self) -> float:  # type: ignore[override]
-        """The present learning rate. Reading it waits for the device, setting it does not."""
+        """The current learning rate. Reading it waits for the device, setting it does not."""
         return self._plain_rate if self._rate is None else float(self._rate)
 
     @learning_rate.setter
@@ -484,7 +484,7 @@ class GraphedPPO(Recorded, PPO):
 
 
 def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
-    """Raise ConfigError for settings that a recurrent network cannot learn with."""
+    """Raise ConfigError for settings that do not work with a recurrent network."""
     if worlds < minibatches:
         raise ConfigError(
             f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, "
@@ -501,22 +501,22 @@ def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | N
 
 
 class UpdateRollback:
-    """Rolls back an update that made a parameter or a loss not finite, or that read values beyond BOUND.
+    """Rolls back an update whose parameters or losses are not finite, or whose inputs exceed BOUND.
 
-    Call ``begin``, update, ``finish``. Masks only, no read from the device; a good update changes in no bit.
+    Call ``begin``, update, ``finish``. It never waits for the device, and changes no bit of a valid update.
     """
 
     def __init__(self, learner: Any, networks: Iterable[nn.Module]) -> None:
-        """``learner`` has rsl-rl's ``storage`` and ``optimizer``; ``networks`` are the networks that learn."""
+        """``learner``: has rsl-rl's ``storage`` and ``optimizer``. ``networks``: the trained networks."""
         self._learner, self._networks, stored = learner, list(networks), learner.storage.observations
         self.columns = [(group, i) for group, value in stored.items() for i in range(value[0, 0].numel())]
         device = learner.storage.rewards.device
         self.undone = torch.zeros((), device=device)  # 1 if the last update was rolled back
-        # 1 where the last update read a bad value: by column of the observations, then the rewards
+        # 1 where the last update read an invalid value: one entry per observation column, then the rewards
         self.wrong = torch.zeros(len(self.columns) + 1, device=device)
 
     def _learned(self) -> dict[str, Tensor]:
-        """Name -> tensor of all that an update changes, as of now: rsl-rl's own normaliser rebinds its std."""
+        """Name -> current tensor that an update changes. Read it each time: rsl-rl's normaliser rebinds its std."""
         optimizer, values = self._learner.optimizer, dict[str, Any]()
         for i, network in enumerate(self._networks):
             values |= {f"{i}.{name}": value for name, value in (*network.named_parameters(), *network.named_buffers())}
@@ -528,12 +528,12 @@ class UpdateRollback:
 
     @torch.no_grad()
     def begin(self) -> None:
-        """Keep the present state."""
+        """Copy the current state."""
         self._before = [(list(kind), _join(kind.values())) for kind in _kinds(self._learned())]
 
     @torch.no_grad()
     def finish(self, losses: Tensor | None = None) -> None:
-        """Restore the state if inputs, results or ``losses`` of the update are bad; set ``undone`` and ``wrong``."""
+        """Restore the state if inputs, results or ``losses`` are invalid. Sets ``undone`` and ``wrong``."""
         stored = self._learner.storage
         wrong = [_beyond(value.flatten(0, 1).flatten(1)) for value in (*stored.observations.values(), stored.rewards)]
         self.wrong.copy_(torch.cat([*wrong[:-1], wrong[-1].any()[None]]))
@@ -542,7 +542,7 @@ class UpdateRollback:
         for names, before in self._before:
             kind = [new.pop(name) for name in names]
             states.append((kind, before, _join(kind)))
-        # Adam's first step made its state, which began with zeros
+        # Adam's first step creates its state; before it, the state is zero
         for kind in [list(kind.values()) for kind in _kinds(new)]:
             states.append((kind, torch.zeros_like(after := _join(kind)), after))
         for _, _, after in states:
@@ -560,7 +560,7 @@ class UpdateRollback:
 
 
 def _kinds(tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
-    """The tensors grouped by type and device, so that each group can be joined."""
+    """The tensors grouped by dtype and device, so that each group can be concatenated."""
     kinds: dict[Any, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         kinds.setdefault((tensor.dtype, tensor.device), {})[name] = tensor
@@ -568,7 +568,7 @@ def _kinds(tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
 
 
 def _on(value: Tensor, device: torch.device) -> Tensor:
-    """``value`` on ``device``: the step counts of rsl-rl's own Adam are on the host."""
+    """``value`` on ``device``. The step counts of rsl-rl's Adam are on the host."""
     return value if value.device == device else value.to(device)
 
 
@@ -577,16 +577,16 @@ def _join(tensors: Iterable[Tensor]) -> Tensor:
 
 
 def _beyond(values: Tensor) -> Tensor:
-    """(C,) True for the columns of ``values`` (B, C) with a value that is not finite, or beyond BOUND."""
+    """(C,) True for each column of ``values`` (B, C) with a value that is not finite or exceeds BOUND."""
     low, high = torch.aminmax(values, dim=0)
     return ~((low >= -BOUND) & (high <= BOUND))
 
 
 # ---- losses ---------------------------------------------------------------------------------------------------------
 #
-# Of a Gaussian policy, as in rsl-rl, with their gradients with respect to the networks' outputs. The formulas stand here
-# once, and autograd differentiates them. On a GPU a kernel computes each with its gradient (fast/kernels.py), and tests
-# hold the kernels to the formulas. Tensors are of B samples; mirror images come last.
+# The losses of a Gaussian policy, as in rsl-rl, and their gradients with respect to the networks' outputs. Autograd
+# differentiates the formulas. On a GPU a kernel computes each loss and its gradient (fast/kernels.py), and tests
+# compare the kernels with the formulas. Tensors have B samples; mirror images come last.
 
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -596,20 +596,20 @@ class PolicyLoss(NamedTuple):
     """Terms of the actor's loss (), and its gradients."""
 
     of_mean: Tensor  # (B, A)
-    of_std: Tensor  # shaped as the std
+    of_std: Tensor  # shape of the std
     surrogate: Tensor
     entropy: Tensor
-    kl: Tensor  # divergence from the policy of the rollout
+    kl: Tensor  # KL divergence from the policy of the rollout
 
 
 def own_std(distribution: GaussianDistribution) -> Tensor:
-    """The std (A,) of a policy that has one for all states, else (B, A)."""
+    """The std: (A,) if it does not depend on the state, else (B, A)."""
     if type(distribution) is not GaussianDistribution:
         return distribution.std
     log = distribution.std_type == "log"
     own = distribution.log_std_param if log else distribution.std_param
     low, high = distribution.log_std_range if log else distribution.std_range
-    std = nn.functional.hardtanh(own, min_val=low, max_val=high)  # a clamp whose gradient is one kernel, not five
+    std = nn.functional.hardtanh(own, min_val=low, max_val=high)  # clamp; its gradient is one kernel, not five
     return std.exp() if log else std
 
 
@@ -617,7 +617,7 @@ def own_std(distribution: GaussianDistribution) -> Tensor:
 def policy_loss(
     mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float, entropy_coef: Tensor
 ) -> PolicyLoss:
-    """PPO's clipped surrogate loss less ``entropy_coef`` times the entropy. Entropy and KL leave out mirror images."""
+    """PPO's clipped surrogate loss minus ``entropy_coef`` x entropy. Entropy and KL are without mirror images."""
     assert batch.old_distribution_params is not None
     kernels, old = kernels_for(mean), batch.old_distribution_params
     if kernels and std.dim() == 1:
@@ -650,7 +650,7 @@ def policy_loss(
 
 @torch.no_grad()
 def value_loss(values: Tensor, batch: RolloutStorage.Batch, clip: float, coef: float) -> tuple[Tensor, Tensor]:
-    """The gradient (B, 1) of ``coef`` times the value loss, and the value loss (); clipped, unless ``clip`` is 0."""
+    """The gradient (B, 1) of ``coef`` x value loss, and the value loss (). It is clipped unless ``clip`` is 0."""
     if kernels := kernels_for(values):
         of_values, terms = torch.empty_like(values), torch.empty_like(values)
         kernels.launch(
@@ -670,16 +670,16 @@ def value_loss(values: Tensor, batch: RolloutStorage.Batch, clip: float, coef: f
 
 # ---- Adam -----------------------------------------------------------------------------------------------------------
 #
-# Adam that a CUDA graph can record, with all parameters in one tensor, and its state in rsl-rl's form. A CPU runs its
-# formulas as they stand here. On a GPU two kernels compute them (fast/kernels.py), and tests hold the kernels to the
-# formulas, and the formulas to torch's own Adam.
+# An Adam that a CUDA graph can record. All parameters are in one tensor, and the state has rsl-rl's form. A CPU runs
+# the formulas below. On a GPU two kernels compute them (fast/kernels.py). Tests compare the kernels with the formulas,
+# and the formulas with torch's Adam.
 
 
-_ALIGNED = 64  # values: fast matrix products want each parameter to begin at a multiple
+_ALIGNED = 64  # values; for fast matrix products each parameter starts at a multiple of it
 
 
 def make_recordable(optimizer: torch.optim.Optimizer, rates: Sequence[Tensor | float], device: str) -> None:
-    """Make an Adam, new or loaded, one that can be recorded, with a learning rate for each of its groups."""
+    """Change a new or loaded Adam so that it can be recorded. ``rates``: learning rate of each group."""
     for group, rate in zip(optimizer.param_groups, rates, strict=True):
         group.update(lr=rate, fused=True, capturable=device.startswith("cuda"))
     for memory in optimizer.state.values():
@@ -687,7 +687,7 @@ def make_recordable(optimizer: torch.optim.Optimizer, rates: Sequence[Tensor | f
 
 
 def plain_state(state: dict[str, Any], rates: Sequence[float]) -> dict[str, Any]:
-    """The state of such an Adam in rsl-rl's form: a count of steps for each parameter."""
+    """The state of a recorded Adam in rsl-rl's form: one step count per parameter."""
     plain = {"fused": None, "capturable": False}
     return {
         "state": {i: {**memory, "step": memory["step"].cpu().clone()} for i, memory in state["state"].items()},
@@ -698,15 +698,15 @@ def plain_state(state: dict[str, Any], rates: Sequence[float]) -> dict[str, Any]
 
 
 class FlatAdam:
-    """Clips and steps a ``part`` of the parameters of an Adam or AdamW, all of them in one tensor.
+    """Clips the gradient and steps a ``part`` of the parameters of an Adam or AdamW, stored in one tensor.
 
-    Parameters and Adam's moments become views of flat tensors; the optimizer's state holds the views.
+    Parameters and moments become views of flat tensors. The optimizer's state holds the views.
     """
 
     def __init__(
         self, optimizer: torch.optim.Optimizer, group: int, part: Sequence[nn.Parameter], limit: float
     ) -> None:
-        """``group``: the part's group in the optimizer; ``limit`` on the norm of its gradient."""
+        """``group``: index of the part's optimizer group; ``limit``: largest norm of its gradient."""
         self._optimizer, self._group, self._limit = optimizer, optimizer.param_groups[group], limit
         self._part = [parameter for parameter in part if parameter.requires_grad]
         first = self._part[0].detach()
@@ -736,7 +736,7 @@ class FlatAdam:
         return self._lay([torch.zeros_like(value) if value.grad is None else value.grad for value in self._part])
 
     def _take_over(self) -> None:
-        """Copy the optimizer's state, new or loaded, into the flat tensors, and make it views of them."""
+        """Copy the optimizer's new or loaded state into the flat tensors, and replace it by views of them."""
         states = [self._optimizer.state[parameter] for parameter in self._part]
         if states[0].get("step") is self._step:
             return
@@ -750,7 +750,7 @@ class FlatAdam:
 
     @torch.no_grad()
     def step(self, gradient: Tensor) -> None:
-        """One step along ``gradient``, at the group's rate."""
+        """One Adam step with ``gradient`` and the group's learning rate."""
         self._take_over()
         group, (mean, square), norm = self._group, self._memory, torch.linalg.vector_norm(gradient)
         rate, (beta1, beta2), eps, decay = (group[name] for name in ("lr", "betas", "eps", "weight_decay"))
@@ -779,8 +779,8 @@ def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tu
 
     Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024.
 
-    ``obs`` may hold any of the environment's groups. A CUDA graph can record it: no read from the device. Look
-    at ``env.mirror`` before recording, as its first use makes tensors.
+    ``obs`` may hold any of the environment's groups. A CUDA graph can record this function. Read ``env.mirror`` once
+    before the recording, because its first use makes tensors.
     """
     table = env.mirror
     if obs is not None:

@@ -1,4 +1,4 @@
-"""One process a GPU, as torchrun starts them: the rank of this process, agreement, and leaving together."""
+"""One process per GPU, started by torchrun: the rank of this process, exchange of values, and the common end."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import torch
 
 from legged_mw.utils.config import ConfigError
 
-_PATIENCE = 20.0  # [s] far more than an iteration and a checkpoint take; torchrun kills after 30
-_sockets: list[tuple[socket.socket, socket.socket]] = []  # referenced here, or they would close and silence the signals
+_PATIENCE = 20.0  # [s] much longer than an iteration with a checkpoint; torchrun kills after 30 s
+_sockets: list[tuple[socket.socket, socket.socket]] = []  # references, so that they stay open for the signals
 
 
 class Rank(NamedTuple):
-    """This process among those of the run."""
+    """The rank of this process."""
 
-    index: int  # over all machines; 0 writes the run folder and speaks to the user
-    local: int  # on this machine: the GPU it uses
-    count: int
+    index: int  # over all machines; 0 writes the run folder and prints
+    local: int  # on this machine: the index of its GPU
+    count: int  # number of processes
 
     @property
     def leads(self) -> bool:
@@ -31,7 +31,7 @@ class Rank(NamedTuple):
 
 
 def this_rank() -> Rank:
-    """The rank in torchrun's environment variables; without them, a single process."""
+    """The rank from torchrun's environment variables; without them a single process."""
     index, local, count = (
         int(os.environ.get(*entry)) for entry in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1"))
     )
@@ -39,7 +39,10 @@ def this_rank() -> Rank:
 
 
 def rank_device(rank: Rank, device: str | None) -> str | None:
-    """The device of this rank: its own GPU, or the CPU for ``--device cpu``. A single process keeps its ``device``."""
+    """The device of this rank: its own GPU, or the CPU for ``--device cpu``. A single process uses ``device``.
+
+    Raises ConfigError for another ``device`` of several ranks, or a GPU that does not exist.
+    """
     if rank.count == 1 or device == "cpu":
         return device
     if device is not None:
@@ -54,7 +57,7 @@ def rank_device(rank: Rank, device: str | None) -> str | None:
 
 
 def first_ranks(value: Any, device: str) -> Any:
-    """The first rank's ``value``, on all ranks."""
+    """Broadcast the first rank's ``value`` to all ranks."""
     if this_rank().count == 1:
         return value
     torch.distributed.broadcast_object_list(agreed := [value], device=torch.device(device))
@@ -62,13 +65,13 @@ def first_ranks(value: Any, device: str) -> Any:
 
 
 def quiet(rank: Rank) -> None:
-    """Silence all ranks but the first."""
+    """Discard the output of all ranks but the first."""
     if not rank.leads:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
 
 
 def first_word(word: str) -> str:
-    """The first word among all ranks that is not empty, with its rank; of a single process, its own."""
+    """The first text of all ranks that is not empty, with its rank; for a single process ``word``."""
     if not torch.distributed.is_initialized():
         return word
     words: list[str] = [""] * torch.distributed.get_world_size()
@@ -77,9 +80,9 @@ def first_word(word: str) -> str:
 
 
 def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
-    """Close the connection once every rank is done. No recorded graph may use it any more.
+    """Close the connection when all ranks are done. No recorded graph may use it after that.
 
-    All files are written by now, so a connection that does not close in time ends with the process.
+    All files are already written, so if the connection does not close within ``patience`` [s] the process ends.
     """
     if rank.count == 1:
         return
@@ -95,7 +98,7 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
     timer = threading.Timer(patience, leave)
     timer.daemon = True
     timer.start()
-    with suppress(RuntimeError):  # another may have left already
+    with suppress(RuntimeError):  # another rank may have ended
         on_gpus = torch.distributed.get_backend() == "nccl"
         torch.distributed.barrier(device_ids=[rank.local] if on_gpus else None)
         torch.distributed.destroy_process_group()
@@ -103,10 +106,10 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
 
 
 def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
-    """After SIGTERM, end this process if it does not end by itself: it may wait for a dead rank.
+    """End this process if it still runs ``patience`` [s] after SIGTERM: it may wait for a rank that has died.
 
-    torchrun sends SIGTERM to the others when one dies. A process that waits for its GPU runs no signal handler in
-    Python, but this thread does run. Call it from the main thread.
+    If one rank dies, torchrun sends SIGTERM to the others. A process that waits for its GPU runs no signal handler in
+    Python, but it runs this thread. Call it from the main thread.
     """
     if rank.count == 1:
         return

@@ -1,8 +1,8 @@
-"""Run folders: making and finding them, their config, the lock of a training, and their checkpoints.
+"""Run folders: creation, search, config, the lock of a training, and checkpoints.
 
-Files of a checkpoint are written whole, and read without running code or trusting a number in them. ``model_N.pt``
-holds networks, optimizer and counters. ``worlds_N.pt`` beside the newest one holds worlds, generators and memories,
-with which a resumed training goes on exactly.
+Checkpoint files are written atomically. Reading one runs no code from it and checks its numbers. ``model_N.pt`` holds
+networks, optimizer and counters. ``worlds_N.pt``, of the newest checkpoint only, holds worlds, random states and hidden
+states, so that a resumed training is exact.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any, Self
 
 try:
     import fcntl
-except ImportError:  # Windows: no locks
+except ImportError:  # Windows has no fcntl, so there are no locks
     fcntl = None
 
 import torch
@@ -50,14 +50,14 @@ def logs_folder() -> Path:
 
 
 def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
-    """The folder of a task's runs, or of the experiment ``name``. Raises UserError for a name that is not allowed."""
+    """The folder of a task's runs, or of the experiment ``name``. Raises UserError for an invalid name."""
     return logs_folder() / check_name(
         name or task.train.runner.experiment_name or task.name, "the name of the experiment"
     )
 
 
 def new_run(experiment: Path, run_name: str) -> Path:
-    """Make and return a run folder below ``experiment``, named by the time."""
+    """Make a run folder in ``experiment``, named by the time, and return it."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{run_name}" if run_name else "")
     for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
         folder = experiment / (stamp + suffix)
@@ -70,10 +70,10 @@ def new_run(experiment: Path, run_name: str) -> Path:
 
 
 def runs(experiment: Path) -> list[Path]:
-    """Readable run folders with a checkpoint, oldest first by the time of their newest checkpoint."""
+    """Readable run folders with a checkpoint, sorted by the time of their newest checkpoint, oldest first."""
     found: dict[Path, int] = {}
     for folder in experiment.glob("*"):
-        # a link to itself, a folder of another user, a checkpoint that is pruned at this moment
+        # a link to itself, a folder of another user, a checkpoint that another process deletes now
         with contextlib.suppress(OSError):
             if there := checkpoints(folder):
                 found[folder] = max(path.stat().st_mtime_ns for path in there.values())
@@ -81,13 +81,13 @@ def runs(experiment: Path) -> list[Path]:
 
 
 def checkpoints(run: Path) -> dict[int, Path]:
-    """Iteration -> checkpoint of a run, in rising order."""
+    """Iteration -> checkpoint of a run, sorted by iteration."""
     named = {path: re.fullmatch(r"model_(\d{1,18})\.pt", path.name) for path in run.glob("model_*.pt")}
     return dict(sorted((int(match[1]), path) for path, match in named.items() if match and path.is_file()))
 
 
 def find_run(experiment: Path, name: str) -> Path:
-    """The run called ``name`` below ``experiment``, or at the path ``name``, or for "-1" the run last trained."""
+    """The run ``name`` in ``experiment`` or at the path ``name``; for "-1" the latest run. Raises ConfigError."""
     found, given = runs(experiment), typed(name)
     if name == "-1":
         if not found:
@@ -102,7 +102,7 @@ def find_run(experiment: Path, name: str) -> Path:
 
 
 def find_checkpoint(run: Path, iteration: int) -> Path:
-    """The checkpoint of ``run`` after ``iteration`` iterations, or for -1 the newest."""
+    """The checkpoint of ``run`` after ``iteration`` iterations; for -1 the newest. Raises ConfigError."""
     found = checkpoints(run)
     if not found:
         raise ConfigError(f"no checkpoint model_<iteration>.pt in {run}")
@@ -114,9 +114,9 @@ def find_checkpoint(run: Path, iteration: int) -> Path:
 
 
 def task_of(run: Path, named: LoadedTask | None = None) -> str:
-    """The ``--task`` of a run: a task of the project, or a file that the task ``named`` is or extends.
+    """The ``--task`` of a run: a task of the project, or the file of the task ``named`` or of one that it extends.
 
-    No other file: a file is code, and the run may be a stranger's. Raises ConfigError that says what to type.
+    Any other file raises ConfigError: a file is code, and the run may come from a stranger.
     """
     stored = load_yaml(run / CONFIG_FILE).get("task", "")
     if not isinstance(stored, str) or not stored:
@@ -128,13 +128,13 @@ def task_of(run: Path, named: LoadedTask | None = None) -> str:
 
 
 def task_at(path: str) -> str:
-    """``task_of`` the run at the path that the user typed, or '' if there is no run."""
+    """``task_of`` for the run at a path that the user typed, or '' if there is no run."""
     run = typed(path)
     return task_of(check_folder(run)) if (run / CONFIG_FILE).is_file() else ""
 
 
 class RunLock:
-    """The lock of the process that trains in a folder. The system releases it however the process ends."""
+    """The lock of the process that trains in a folder. The system releases it when the process ends in any way."""
 
     def __init__(self, folder: Path) -> None:
         """Raises ConfigError if another process has the lock, OSError if the folder cannot be written."""
@@ -156,7 +156,7 @@ class RunLock:
             )
 
     def begin(self) -> None:
-        """Write the owner into the lock, and delete half-written files of a killed process."""
+        """Write the owner into the lock, and delete incomplete files of killed processes."""
         self._file.truncate(0)
         self._file.write(f"process {os.getpid()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
         self._file.flush()
@@ -172,31 +172,31 @@ class RunLock:
         self._file.close()
 
     def lost(self) -> bool:
-        """Whether somebody has deleted the folder and the lock in it."""
+        """Whether the lock file was deleted, with its folder."""
         return os.fstat(self._file.fileno()).st_nlink == 0
 
 
 class CheckpointWriter:
-    """Writes checkpoints and prunes old ones. If one cannot be written, it warns and the training goes on."""
+    """Writes checkpoints and deletes old ones. If one cannot be written, it warns and the training continues."""
 
     def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:
-        """``keep``: number of newest checkpoints that stay, 0: all. ``prepare``: make a lost folder, return whether."""
+        """``keep``: number of checkpoints to keep, 0: all. ``prepare``: restore a deleted folder, return whether."""
         self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
-        self.failed = ""  # why the newest checkpoint could not be written, or ''
-        self.written: Path | None = None  # the newest one that was written
-        self.moved = False  # the folder was made again
+        self.failed = ""  # why the last checkpoint could not be written, or ''
+        self.written: Path | None = None  # the newest written checkpoint
+        self.moved = False  # the last ``prepare`` made the folder again
 
     def write(
         self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]
     ) -> bool:
-        """Write worlds, then the checkpoint, then prune; returns whether the checkpoint is written."""
+        """Write worlds and checkpoint, then delete old files. Returns whether the checkpoint is written."""
         path = self.folder / f"model_{iteration}.pt"
         try:
             self.moved = self._prepare()
             self._write_worlds(worlds, worlds_file(path, self._rank), path)
             if self._rank.leads:
                 save_whole(checkpoint(), path)
-        except (OSError, MemoryError) as error:  # the file is composed in memory
+        except (OSError, MemoryError) as error:  # the file is first made in memory
             self.failed = reason_of(error)
             newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
             print(
@@ -205,7 +205,7 @@ class CheckpointWriter:
             )
             if not path.exists():
                 with contextlib.suppress(OSError):
-                    worlds_file(path, self._rank).unlink(missing_ok=True)  # useless, and the disk is full
+                    worlds_file(path, self._rank).unlink(missing_ok=True)  # useless without its checkpoint
             return False
         self.failed, self.written = "", path
         with contextlib.suppress(OSError):
@@ -213,9 +213,9 @@ class CheckpointWriter:
         return True
 
     def _write_worlds(self, worlds: Callable[[], dict[str, Any]], file: Path, checkpoint: Path) -> None:
-        """Write the worlds if there is room: they are many times as large as the checkpoint, which may fit without."""
+        """Write the worlds, or warn: they are many times larger than the checkpoint, which may still fit the disk."""
         try:
-            save_whole(worlds(), file, sync=False)  # its reader detects a file torn by a power cut
+            save_whole(worlds(), file, sync=False)  # the reader detects a file damaged by a power cut
         except (OSError, MemoryError) as error:
             print(
                 f"WARNING: {file.name} cannot be written: {reason_of(error)}; from {checkpoint.name} worlds begin anew",
@@ -223,10 +223,10 @@ class CheckpointWriter:
             )
 
     def _prune(self) -> None:
-        """Delete worlds of checkpoints before the newest, and the oldest checkpoints.
+        """Delete the worlds of all checkpoints but the newest, and the oldest checkpoints.
 
-        A rank that comes here before the first one has written the newest checkpoint leaves the worlds of the one
-        before. The first rank also deletes worlds of an earlier training with another number of processes.
+        If the first rank has not yet written the newest checkpoint, the other ranks keep the worlds of the previous
+        one. The first rank also deletes worlds of an earlier training with another number of processes.
         """
         there = checkpoints(self.folder)
         newest, rank = max(there, default=0), self._rank
@@ -241,7 +241,7 @@ class CheckpointWriter:
 
 
 def reason_of(error: BaseException) -> str:
-    """Why a file could not be written: the system's reason, if a library's error hides one."""
+    """Why a file could not be written: the system's reason if the error has one as its cause."""
     first: BaseException | None = error
     while first is not None and not isinstance(first, OSError):
         first = first.__cause__ or first.__context__
@@ -251,7 +251,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed programs left half written in ``folder``: ``.NAME.PID.tmp`` of a process that is gone."""
+    """Delete incomplete files of killed programs in ``folder``: ``.NAME.PID.tmp`` whose process has ended."""
     for path in folder.glob(".*.tmp"):
         name = re.fullmatch(r"\.(export|.+\.(?:pt|yaml))\.(\d{1,9})\.tmp", path.name)
         if not name or _lives(int(name[2])):
@@ -267,24 +267,24 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # it is another user's
+    except OSError:  # the process belongs to another user
         return True
     return True
 
 
 def worlds_file(checkpoint: Path, rank: Rank) -> Path:
-    """The file of the worlds of ``rank`` beside ``checkpoint``."""
+    """The file with the worlds of ``rank`` for ``checkpoint``."""
     return checkpoint.with_name(f"worlds_{checkpoint.stem.removeprefix('model_')}{suffix_of(rank)}.pt")
 
 
 def suffix_of(rank: Rank) -> str:
-    """The part of a file's name that is the rank's own; '' for a single process."""
+    """The part of a file name that identifies the rank; '' for a single process."""
     return f"_{rank.index}of{rank.count}" if rank.count > 1 else ""
 
 
 # ---- config.yaml, old names included ----------------------------------------------------------------------------------
 
-# A field of runs of 0.1 -> the keys that lead to its value now.
+# Field in runs of version 0.1 -> keys of its new place.
 RENAMED: dict[str, tuple[str, ...]] = {
     "perturbation.enable": ("perturbation", "kick"),
     "cpu.keep_probability": ("cpu", "overrides", "commands.keep_probability"),
@@ -293,14 +293,14 @@ RENAMED: dict[str, tuple[str, ...]] = {
 
 
 def of_project(stored: str) -> str:
-    """``--task`` for the task that a run's config names; "" if it is not this project's: no run may start such a file.
+    """``--task`` for the task in a run's config; "" if the task is not of this project: a run must not start its file.
 
-    This project's are the names in configs/, and files that really lie in configs/ or examples/ of package or clone.
+    Tasks of this project are names in configs/, and files in configs/ or examples/ of the package or the clone.
     """
     if Path(stored).suffix != ".py":
-        return stored  # a name; there is none outside of configs/
+        return stored  # a name: names exist only in configs/
     folders = [(ROOT / name).resolve() for name in ("configs", "examples")]
-    with contextlib.suppress(OSError, ValueError, RuntimeError):  # a name that no file can have, a link to itself
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # an invalid file name, a link to itself
         for file in ((place / stored).resolve() for place in (Path.cwd(), ROOT)):
             if file.is_file() and file.parent in folders:
                 return str(file)
@@ -308,15 +308,15 @@ def of_project(stored: str) -> str:
 
 
 def somebodys(stored: str) -> str:
-    """What a task's file is that is not ``of_project``, and the flag that runs it."""
+    """Message text on a task's file that is not ``of_project``, with the flag that runs it."""
     return f"somebody's code, which no run starts by itself: read it, then say --task {shlex.quote(stored[:200])}"
 
 
 def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> list[str]:
-    """Give ``task`` the fields in the ``config.yaml`` of one of its runs, which may use old names.
+    """Set the fields of ``task`` to the ``config.yaml`` of one of its runs, which may use old names.
 
-    A learner's section that the file lacks is newer than the run. It takes the base class's values, as the run did, not
-    those of today's task. Returns the names of these sections.
+    If the file lacks a learner's section, the run is older than the section. The section then gets the values of the
+    base class, as the run had them, not those of the task. Returns the names of these sections.
     """
     saved = _with_new_names(saved)
     theirs = str(saved.get("task", task.name))
@@ -334,7 +334,7 @@ def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> l
 
 
 def _with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy in which every old name of a field, or of a class's module, is replaced by the new one."""
+    """A copy with the new names of renamed fields and of renamed modules of classes."""
     config: dict[str, Any] = copy.deepcopy(dict(saved))
     for old, (*sections, name) in RENAMED.items():
         section, _, field = old.partition(".")
@@ -343,7 +343,7 @@ def _with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
         value, node = config[section].pop(field), config
         for key in sections:
             node = node.setdefault(key, {}) if isinstance(node, dict) else None
-        if isinstance(node, dict):  # else the file is wrong there, and loading it says so
+        if isinstance(node, dict):  # otherwise the file is invalid, and loading it raises
             node[name] = value
     for section in config.values():
         name = section.get("class_name") if isinstance(section, dict) else None
@@ -354,7 +354,7 @@ def _with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _is_own_file(task: LoadedTask, file: Path) -> bool:
-    """Whether an absolute path is the task's own robot: runs once stored the path of their machine."""
+    """Whether an absolute path is the task's robot file: old runs stored the path on their machine."""
     if not file.is_absolute() or file.name != Path(task.cfg.asset.file).name:
         return False
     return not file.exists() or file.samefile(find_file(task.cfg, "asset.file"))
@@ -368,7 +368,7 @@ EARLIER = "an earlier one is named by --checkpoint"
 
 
 def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
-    """Write a checkpoint with its checksum: whole, or not at all after a kill (``sync``: or a power cut)."""
+    """Write a checkpoint with its checksum, atomically if the process is killed; with ``sync`` also at a power cut."""
     temporary, archive = path.with_name(f".{path.name}.{os.getpid()}.tmp"), io.BytesIO()
     torch.save(content, archive)
     try:
@@ -383,7 +383,7 @@ def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
 
 
 def load_tensors(path: Path, device: str) -> dict[str, Any]:
-    """Read a checkpoint, whose networks and counters are finite; runs no code from it. Raises ConfigError."""
+    """Read a checkpoint without running code from it, and check its networks and counters. Raises ConfigError."""
     try:
         content = unpack(path.read_bytes(), device)
     except FileNotFoundError:
@@ -409,24 +409,24 @@ def load_tensors(path: Path, device: str) -> dict[str, Any]:
 
 
 def unpack(written: bytes, device: str) -> Any:
-    """The content of a file; runs no code from it. Raises ValueError that says why the file is corrupt."""
+    """The content of a file, without running code from it. Raises ValueError with the reason if it is corrupt."""
     if why := damage(written):
         raise ValueError(why)
     try:
         return torch.load(io.BytesIO(written), map_location=device, weights_only=True)
-    except Exception:  # a zip, pickle or tensor error; torch's own text advises to load the file unsafely
+    except Exception:  # a zip, pickle or tensor error; torch's message advises unsafe loading
         raise ValueError("it is damaged, or holds more than tensors and numbers") from None
 
 
 def sealed(archive: bytes) -> bytes:
-    """The zip ``archive`` of torch with its SHA-256 as the zip's comment, which torch ignores."""
-    head = archive[:-2]  # without the length of the comment, which is 0
+    """torch's zip ``archive`` with its SHA-256 as the zip comment, which torch ignores."""
+    head = archive[:-2]  # without the length of the empty comment
     note = _SEAL + hashlib.sha256(head).hexdigest().encode()
     return head + struct.pack("<H", len(note)) + note
 
 
 def damage(content: bytes) -> str:
-    """Why the file is corrupt, or ''. Sealed files are checked by SHA-256, older ones by the zip's CRCs."""
+    """Why the file is corrupt, or ''. ``sealed`` files are checked by SHA-256, older ones by the zip's CRCs."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             if note := archive.comment:
@@ -437,20 +437,20 @@ def damage(content: bytes) -> str:
                 return "it is damaged: parts of it are compressed"
             part = archive.testzip()
             return f"it is damaged: the checksum of its part {part} is wrong" if part else ""
-    except Exception as error:  # zipfile raises many kinds
+    except Exception as error:  # zipfile raises many types
         return f"it is damaged: {error}"
 
 
-# ---- what a checkpoint must be like ---------------------------------------------------------------------------------
+# ---- checks of a checkpoint -----------------------------------------------------------------------------------------
 
-# Tensors that are never below 0, by the last part of a name: of normalisers, of Adam, of a task.
+# Tensors that are never negative, by the last part of their name: of normalisers, Adam and tasks.
 _FROM_ZERO = {"_var", "_std", "count", "step", "exp_avg_sq", "square_avg", "num_envs", "motion_failures"}
 _FROM_ZERO |= {"kick_level", "pull_level", "terrain_levels", "command_curriculum"}
 
 
 def check_fit(saved: Mapping[str, Tensor], own: Mapping[str, Tensor], path: Path, what: str) -> None:
     """Raise ConfigError unless ``saved`` in ``path`` has the names, shapes and types of ``own``, and finite values."""
-    for name in sorted({**own, **saved}, key=lambda name: name in own and name in saved):  # a missing one says most
+    for name in sorted({**own, **saved}, key=lambda name: name in own and name in saved):  # missing names first
         there, here = _shape(saved.get(name)), _shape(own.get(name))
         if there != here:
             raise ConfigError(f"{path} does not fit this task: {what} {name} is {there} there and {here} here")
@@ -460,7 +460,7 @@ def check_fit(saved: Mapping[str, Tensor], own: Mapping[str, Tensor], path: Path
 def check_resume(
     content: Mapping[str, Any], path: Path, own: Mapping[str, Any], optimizer: torch.optim.Optimizer
 ) -> None:
-    """Raise ConfigError unless a run, which would now write ``own``, can go on from ``content``."""
+    """Raise ConfigError unless a run can resume from ``content``. ``own``: the checkpoint that it would write now."""
     done, named = content["iter"], re.fullmatch(r"model_(\d+)\.pt", path.name)
     if named and int(named[1]) != done:
         raise ConfigError(
@@ -471,7 +471,7 @@ def check_resume(
     with _part(path, "optimizer_state_dict"):
         saved = {**content["optimizer_state_dict"]}
         for group, mine in zip(saved["param_groups"], own["optimizer_state_dict"]["param_groups"], strict=True):
-            # a newer torch may have more switches
+            # a newer torch may have more options
             switches = {name: value for name, value in mine.items() if value is None or isinstance(value, bool)}
             theirs = {**switches, **group}
             _check_number(theirs["lr"])
@@ -494,7 +494,7 @@ def check_resume(
 
 @contextlib.contextmanager
 def _part(path: Path, name: str) -> Iterator[None]:
-    """Any error in the body means that the part ``name`` of the file is none of this version."""
+    """Raise any error of the body as a ConfigError: the part ``name`` of the file is of another version."""
     try:
         yield
     except ConfigError:
@@ -510,7 +510,7 @@ def _check_number(value: Any) -> None:
 
 
 def _check_values(saved: Mapping[str, Tensor], path: Path, what: str) -> None:
-    """Raise ConfigError unless all are plain tensors of finite numbers, and from 0 where nothing else can be."""
+    """Raise unless all values are plain tensors of finite numbers, and those of ``_FROM_ZERO`` not negative."""
     for name, value in saved.items():
         if value.layout != torch.strided or value.is_meta or value.is_quantized or value.is_complex():
             raise ValueError(f"{name} is no plain tensor")
@@ -523,14 +523,14 @@ def _check_values(saved: Mapping[str, Tensor], path: Path, what: str) -> None:
 
 
 def _shape(value: Any) -> str:
-    """What must be equal in a file and here."""
+    """Shape and dtype as text: they must be equal in a file and here."""
     if not isinstance(value, Tensor):
         return "missing" if value is None else f"a {type(value).__name__}"
     return f"{tuple(value.shape)} {value.dtype}".removesuffix(" torch.float32").replace("torch.", "")
 
 
 def _resized(own: Tensor, saved: Tensor) -> Tensor:
-    """``own`` for as many worlds as ``saved`` has."""
+    """``own`` resized to the number of worlds in ``saved``."""
     if not own.dim() or saved.dim() != own.dim() or not len(saved):
         return own
     return own[:1].expand(len(saved), *own.shape[1:])

@@ -1,4 +1,4 @@
-"""The training loop: rsl-rl's runner with a loop of its own, in which a rollout never waits for the device."""
+"""The training loop: rsl-rl's runner with another ``learn``, whose rollouts never wait for the device."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ from legged_mw.utils.machine import usable_cores
 class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
-    ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a
+    ``current_learning_iteration`` counts finished iterations: ``model_100.pt`` is saved after 100 of them, and a
+    resumed run starts with the 101st. Set ``stop`` to a reason to end the run after the current iteration, with a
     checkpoint.
     """
 
@@ -78,9 +78,9 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
-        self.deadline: float | None = None  # end of `learn` and of its annealing [s, time.time()]
+        self.deadline: float | None = None  # time at which `learn` and its annealing end [s, time.time()]
         self.schedule = TrainingSchedule()
-        self.diverged = ""  # why the runner set `stop` by itself
+        self.diverged = ""  # why the runner itself set `stop`
         self.why_not_exact = "it is a new run"  # why `load` did not restore the worlds of a checkpoint
         self.writer: CheckpointWriter | None = None  # made in `learn` if the run has a folder
         self._divergence = DivergenceStop()
@@ -89,7 +89,7 @@ class Runner(OnPolicyRunner):
         self._rollback = learner.rollback if recorded else UpdateRollback(learner, self._networks().values())
         self._rolls_back = not recorded  # the recorded update rolls itself back
         self._finite_check = FiniteCheck([name for each in env.nonfinite for name in each.names], self._stored_names())
-        # policy -> figures, which are logged: called every `exam_interval` iterations and after the last
+        # policy -> figures for the log; called every `exam_interval` iterations and after the last one
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self.update_threads = nullcontext()
@@ -100,7 +100,7 @@ class Runner(OnPolicyRunner):
         self._last_means: dict[str, float] = {}
 
     def _configure_multi_gpu(self) -> None:
-        """rsl-rl's own method on GPUs (NCCL); gloo between processes on a CPU."""
+        """Connect the ranks: by rsl-rl's method (NCCL) on GPUs, by gloo on a CPU."""
         rank = this_rank()
         if rank.count == 1 or self.device != "cpu":
             super()._configure_multi_gpu()
@@ -113,11 +113,11 @@ class Runner(OnPolicyRunner):
     # ---- the loop -------------------------------------------------------------------------------------------------
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = True) -> None:
-        """Run that many iterations: roll out, update, log, save. End early, after a checkpoint, once ``stop`` is set.
+        """Run iterations of rollout, update, log and checkpoint. If ``stop`` is set, save a checkpoint and end early.
 
-        On a GPU an iteration is logged while the next one runs, so that the device never waits for the host.
+        On a GPU an iteration is logged while the next one runs, so the device never waits for the host.
         """
-        if init_at_random_ep_len:  # else every world would time out in the same step
+        if init_at_random_ep_len:  # otherwise all worlds time out in the same step
             self.env.episode_length_buf = torch.randint_like(
                 self.env.episode_length_buf, high=self.env.max_episode_length
             )
@@ -134,7 +134,7 @@ class Runner(OnPolicyRunner):
         self._all_stop = False
         start = clock.mark()
         while self.current_learning_iteration < self.schedule.last and not self._must_stop():
-            self._anneal()  # first, so that a resumed rollout is what it would have been
+            self._anneal()  # before the rollout, so that a resumed rollout is equal to an uninterrupted one
             if self._rolls_back:
                 self._rollback.begin()
             obs = self._rollout(obs)
@@ -154,7 +154,7 @@ class Runner(OnPolicyRunner):
                 and self.current_learning_iteration < self.schedule.last
             ):
                 self._save_checkpoint()
-            # the waiting report is not logged before an exam: ranks must learn of a stop in the same iteration
+            # the waiting report is not logged before an exam: all ranks must read a stop in the same iteration
             if self._exam_is_due():
                 self._examine()
                 start = clock.mark()
@@ -166,12 +166,12 @@ class Runner(OnPolicyRunner):
         self._end_curves()
 
     def _make_schedule(self, last: int) -> None:
-        """Plan until the iteration ``last`` or the deadline, by the clock of the first rank."""
+        """Make the schedule up to iteration ``last`` or the deadline, by the clock of the first rank."""
         self.schedule = TrainingSchedule(last, self.deadline, self.schedule.seconds)
         self.schedule.done, self.console.deadline = first_ranks(self.schedule.done, self.device), self.deadline
 
     def _anneal(self) -> None:
-        """Set the annealed numbers, linear from the first iteration to the last; end the critic's warm-up."""
+        """Interpolate the annealed settings linearly over the training, and end the critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
             self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
         done = self.schedule.begin(self.current_learning_iteration)
@@ -181,7 +181,7 @@ class Runner(OnPolicyRunner):
         self.env.on_training_progress(done)
 
     def _must_stop(self) -> bool:
-        """Whether to stop. Ranks stop together, one iteration after the first signal: an update needs all of them."""
+        """Whether to stop. An update needs all ranks, so all of them stop one iteration after the first signal."""
         if not self.is_distributed:
             return self.stop is not None
         if self._all_stop:
@@ -211,33 +211,33 @@ class Runner(OnPolicyRunner):
             return losses
 
     def _exam_is_due(self) -> bool:
-        """Every ``exam_interval`` iterations but the last, whose exam comes after the last checkpoint."""
+        """True every ``exam_interval`` iterations, except the last: its exam runs after the last checkpoint."""
         interval, done = self.cfg["exam_interval"], self.current_learning_iteration
         return self.examine is not None and interval > 0 and done % interval == 0 and done < self.schedule.last
 
     def _next_exam(self, done: int) -> int | None:
-        """The iteration that ends with the next exam, or None."""
+        """The iteration after which the next exam runs, or None."""
         interval = self.cfg["exam_interval"]
         if self.examine is None or interval <= 0:
             return None
         return min((done // interval + 1) * interval, self.schedule.last)
 
     def _examine(self) -> None:
-        """Grade the present policy. Only the first rank has an exam; the others wait in the next update."""
+        """Run the exam on the current policy. Only the first rank has one; the others wait in the next update."""
         assert self.examine is not None
         if self.device != "cpu":
-            torch.cuda.synchronize(self.device)  # so that the exam's time is the exam's alone
+            torch.cuda.synchronize(self.device)  # so that the measured time is that of the exam only
         policy, begun = self.alg.get_policy(), time.time()
         training, memory = policy.training, policy.get_hidden_state()
         try:
             figures = self.examine(policy.eval())
-        except Exception as error:  # a failed exam must not cost hours of training
+        except Exception as error:  # a failed exam must not end a training
             print(f"WARNING: the exam failed, training goes on without: {type(error).__name__}: {error}", flush=True)
             self.examine = None
             return
         finally:
             policy.train(training)
-            policy.reset(hidden_state=memory)  # of the training's worlds
+            policy.reset(hidden_state=memory)  # hidden state of the training worlds
         self.last_exam = self.current_learning_iteration, figures
         found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
         self._draw_curves(found, self.current_learning_iteration)
@@ -246,7 +246,7 @@ class Runner(OnPolicyRunner):
     # ---- the log --------------------------------------------------------------------------------------------------
 
     def _report(self, losses: dict[str, Any], marks: tuple[Mark, Mark, Mark]) -> Report:
-        """Count the iteration and send its numbers to the host, without waiting for them."""
+        """Count the iteration and start the copy of its numbers to the host."""
         self.current_learning_iteration += 1
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
@@ -282,14 +282,14 @@ class Runner(OnPolicyRunner):
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
     def _action_std(self) -> Tensor:
-        """Mean standard deviation () of the actions: of a Gaussian in the last rollout, else the present one."""
+        """Mean standard deviation () of the actions: over the last rollout for a Gaussian, else the current one."""
         policy, params = self.alg.get_policy(), getattr(self.alg.storage, "distribution_params", None)
         if isinstance(policy.distribution, GaussianDistribution) and params is not None:
             return params[1].mean()
         return policy.output_std.detach().mean()
 
     def _log(self, report: Report) -> None:
-        """Write a line to the console and a point a curve; stop the training if the numbers say so."""
+        """Write an iteration to the console and the curves, and set ``stop`` if the training diverged."""
         read = report.message.read()
         numbers = self.env.name_statistics(read.statistics)
         self._all_stop = read.stop[0] > 0
@@ -320,7 +320,7 @@ class Runner(OnPolicyRunner):
             self._warned_overflow = True
 
     def _stored_names(self) -> list[str]:
-        """Names of the columns that an update reads, in words: of each observation group, then the rewards."""
+        """Names of the columns that an update reads: the observation columns by group, then the rewards."""
         table, names = self.env.observations, []
         rows = {group: [row.name for row in table.rows(group) for _ in range(row.size)] for group in table.groups}
         for group, i in self._rollback.columns:
@@ -329,13 +329,13 @@ class Runner(OnPolicyRunner):
             )
         return [*names, "the rewards"]
 
-    # ---- curves: if they cannot be written, training goes on ------------------------------------------------------
+    # ---- curves: if they cannot be written, training continues ----------------------------------------------------
 
     def _open_curves(self) -> None:
         quiet_writers()
         try:
             self.logger.init_logging_writer()
-        except Exception as error:  # whatever a logging service may throw
+        except Exception as error:  # a logging service may raise any exception
             self._lose_curves(error)
 
     def _draw_curves(self, values: dict[str, float], iteration: int) -> None:
@@ -347,28 +347,28 @@ class Runner(OnPolicyRunner):
             self._lose_curves(error)
 
     def _end_curves(self) -> None:
-        """Write all curves before the training ends; else a thread would write into a finished run."""
+        """Write all curves before the training ends: a writer's thread must not write into a finished run."""
         try:
             self.logger.stop_logging_writer()
             if flush := getattr(self.logger.writer, "flush", None):
                 flush()
-        except Exception as error:  # whatever a logging service may throw
+        except Exception as error:  # a logging service may raise any exception
             self._lose_curves(error)
 
     def _lose_curves(self, error: Exception) -> None:
-        """Go on without curves until the next checkpoint."""
+        """Stop writing curves until the next checkpoint."""
         print(f"WARNING: no curves until the next checkpoint, they cannot be written: {reason_of(error)}", flush=True)
         self.logger.writer, self._curves_lost = None, True
 
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     def _networks(self) -> dict[str, nn.Module]:
-        """The networks in a checkpoint, by rsl-rl's names; the first is the policy."""
+        """rsl-rl's name -> network, for the networks in a checkpoint. The first is the policy."""
         names = ("student", "teacher") if isinstance(self.alg, Distillation) else ("actor", "critic")
         return {name: getattr(self.alg, name) for name in names}
 
     def _save_checkpoint(self) -> None:
-        """Write a checkpoint if the networks are finite: training must be able to go on from the newest one."""
+        """Write a checkpoint if the networks are finite: the newest checkpoint must be one to resume from."""
         done = self.current_learning_iteration
         weights = [weight for network in self._networks().values() for weight in network.parameters()]
         if not all(bool(weight.isfinite().all()) for weight in weights):
@@ -383,12 +383,12 @@ class Runner(OnPolicyRunner):
             self._open_curves()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """rsl-rl's method: one checkpoint, whole or not at all. Training itself calls ``_save_checkpoint``."""
+        """rsl-rl's method: write one checkpoint atomically. ``learn`` calls ``_save_checkpoint`` instead."""
         save_whole(self._content(infos), Path(path))
         self.logger.save_model(path, self.current_learning_iteration)
 
     def _content(self, infos: dict | None = None) -> dict[str, Any]:
-        """A checkpoint: tensors and plain numbers only."""
+        """The content of a checkpoint: tensors and Python numbers only."""
         infos = {
             **(infos or {}),
             "total_steps": self.total_steps,
@@ -401,7 +401,7 @@ class Runner(OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Load a checkpoint, and the worlds beside it if they are the same."""
+        """Load a checkpoint, and its worlds file if it fits. Raises ConfigError."""
         content = load_tensors(Path(path), map_location or self.device)
         (first, actor), (second, other) = self._networks().items()
         check_fit(content.get(f"{first}_state_dict", {}), actor.state_dict(), Path(path), first)
@@ -412,33 +412,33 @@ class Runner(OnPolicyRunner):
         check_resume(content, Path(path), self._content(), self.alg.optimizer)
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
-        if isinstance(self.alg, GraphedPPO):  # as in the last update, so that `_anneal` sees the end of a warm-up
+        if isinstance(self.alg, GraphedPPO):  # the value of the last update, so that `_anneal` ends a warm-up
             self.alg.critic_only = 0 < self.current_learning_iteration <= self.cfg["critic_warmup"]
-        # a fixed rate is the config's, which the user may have changed; an adaptive one is the checkpoint's
+        # a fixed rate comes from the config, which the user may have changed; an adaptive one from the checkpoint
         if getattr(self.alg, "schedule", "fixed") == "fixed":
             self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
             for group in self.alg.optimizer.param_groups:
-                if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
+                if not isinstance(group["lr"], Tensor):  # a tensor is set by `alg.learning_rate`
                     group["lr"] = self.alg.learning_rate
         infos = content.get("infos") or {}
         self.total_steps, self.schedule = infos.get("total_steps", 0), TrainingSchedule(used=infos.get("seconds", 0.0))
-        self.env.load_training_state(infos.get("env", {}))  # before the random state: it resets worlds
+        self.env.load_training_state(infos.get("env", {}))  # before the random state, because it resets worlds
         random = infos.get("random_state", {})
         self.why_not_exact = first_word(self._restore_worlds(Path(path), random))
         if self.why_not_exact and self.env.cfg.domain_rand.redraw_iterations:
-            self.env.domain_rand.redraw()  # the seed's own draws were those of the first iterations
+            self.env.domain_rand.redraw()  # the values drawn at the start belong to the first iterations
         if self.gpu_global_rank == 0:
             set_random_state(random, self.device)
-        elif self.why_not_exact:  # the checkpoint holds the first rank's state; the others must draw other numbers
+        elif self.why_not_exact:  # the checkpoint holds only the first rank's state; other ranks need other numbers
             torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
 
-    # The worlds have a file of their own beside the checkpoint, as it is large and not needed to play a policy. It is
-    # written before its checkpoint, and the file of the checkpoint before is deleted after, so that a kill at any
-    # moment leaves the newest checkpoint with its worlds.
+    # The worlds are in a separate file, because it is large and not needed to play a policy. It is written before its
+    # checkpoint, and the previous worlds file is deleted after, so the newest checkpoint always has its worlds, even
+    # if the process is killed.
 
     def _worlds(self) -> dict[str, Any]:
-        """The content of the file of worlds: tensors and plain numbers only."""
+        """The content of the worlds file: tensors and Python numbers only."""
         return {
             **same_worlds(self.env),
             "random_state": random_state(self.device),
@@ -447,7 +447,10 @@ class Runner(OnPolicyRunner):
         }
 
     def _restore_worlds(self, checkpoint: Path, random: dict[str, Tensor]) -> str:
-        """Restore worlds and memories of ``checkpoint``, whose generators are ``random``; returns why not, or ''."""
+        """Restore the worlds and hidden states of ``checkpoint``. Returns why this is not possible, or ''.
+
+        ``random``: the random state in the checkpoint.
+        """
         rank, here, own = this_rank(), same_worlds(self.env), self._memories()
         file = worlds_file(checkpoint, rank)
         if not file.is_file():
@@ -456,7 +459,7 @@ class Runner(OnPolicyRunner):
             content = unpack(file.read_bytes(), "cpu")
             there = {key: content[key] for key in here}
             state, worlds, memories = (dict(content[key]) for key in ("random_state", "worlds", "memories"))
-        except Exception as error:  # of any kind: it may hold anything
+        except Exception as error:  # any kind, because the file may hold anything
             return f"{file.name} cannot be read: {' '.join(f'{error}'.split())}"
         same = state.keys() == random.keys() and all(torch.equal(state[key], random[key].cpu()) for key in state)
         if rank.leads and not same:
@@ -477,7 +480,7 @@ class Runner(OnPolicyRunner):
         return ""
 
     def _memories(self) -> dict[str, Tensor]:
-        """Hidden states of the recurrent networks, by number."""
+        """Index -> hidden state of the recurrent networks."""
         states: dict[Any, Any] = getattr(self.alg, "_memories", {})
         return {str(i): state.now for i, state in enumerate(states.values())}
 
@@ -485,7 +488,10 @@ class Runner(OnPolicyRunner):
 def make_runner(
     env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None
 ) -> Runner:
-    """A runner over ``env``. With the config of a ``teacher`` it distils; without ``log_dir`` it writes nothing."""
+    """Make a runner. With a ``teacher``'s config it runs distillation. Without ``log_dir`` it writes no files.
+
+    Raises ConfigError for settings that do not fit the environment or rsl-rl.
+    """
     half = cfg.runner.matmul_precision == "bf16"
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
@@ -512,27 +518,27 @@ def make_runner(
 
 
 def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
-    """If learning needs mirror images, raise ConfigError now, not after a rollout, for rows without one."""
+    """Raise ConfigError if learning needs mirror images and a row has none, before the first rollout."""
     if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
         _ = env.mirror
 
 
-# ---- how far a training is ------------------------------------------------------------------------------------------
+# ---- the progress of a training -------------------------------------------------------------------------------------
 
 
-_WINDOW = 50  # iterations, whose median duration says how many more there is time for
+_WINDOW = 50  # iterations; their median duration gives the number of iterations left
 
 
 class TrainingSchedule:
-    """The last iteration of a training, and how much of it is ``done``: 0 in the first iteration, 1 in the last.
+    """The last iteration of a training and its progress ``done``: 0 in the first iteration, 1 in the last.
 
-    With a ``deadline`` the last iteration is an estimate, made again after each iteration, and ``done`` rises to 1 in
-    even steps over the iterations left. So compiling, exams and checkpoints change the steps but not the end.
+    With a ``deadline`` the last iteration is estimated again after each iteration, and ``done`` rises linearly to 1
+    over the iterations left. So compilation, exams and checkpoints change the slope, not the end.
     """
 
     def __init__(self, last: int = 0, deadline: float | None = None, used: float = 0.0) -> None:
-        """Until the iteration ``last`` or the ``deadline`` [s, time.time()]; ``used`` [s]: duration before a resume."""
-        self.last = self._wanted = last  # with a deadline, an estimate
+        """``last`` iteration, ``deadline`` [s, time.time()]; ``used`` [s]: duration before a resume."""
+        self.last = self._wanted = last  # with a deadline ``last`` is an estimate
         self.deadline, self._used, self._begun = deadline, used, time.time()
         room = max(deadline - self._begun, 0.0) if deadline else 0.0
         self.done = used / (used + room) if room else 0.0
@@ -540,15 +546,15 @@ class TrainingSchedule:
 
     @property
     def seconds(self) -> float:
-        """Duration of the training so far, with the time before a resume [s]; 0 if it never had a deadline."""
+        """Duration of the training [s], including the time before a resume; 0 if it never had a deadline."""
         return self._used + time.time() - self._begun if self.deadline or self._used else 0.0
 
     def saved(self) -> dict[str, float]:
-        """The entry of a checkpoint; none without a deadline, as such trainings are equal to the bit."""
+        """The entry in a checkpoint. Empty without a deadline: repeated runs then write the same bits."""
         return {"seconds": seconds} if (seconds := self.seconds) else {}
 
     def begin(self, iteration: int) -> float:
-        """Begin an iteration, after so many others; returns ``done``."""
+        """Begin an iteration, after ``iteration`` finished ones. Returns ``done``."""
         share = iteration / max(self._wanted - 1, 1)
         if self.deadline:
             step = 0.0 if self._first else (1.0 - self.done) / max(self.last - iteration, 1)
@@ -557,7 +563,7 @@ class TrainingSchedule:
         return self.done
 
     def iterations_left(self) -> float:
-        """End an iteration: how many more there is time for, by the median of the last ones; inf if not known."""
+        """End an iteration. Returns the number left before the deadline, by the median duration; inf if unknown."""
         now = time.time()
         self._times.append(now - self._before)
         self._before = now
@@ -567,32 +573,32 @@ class TrainingSchedule:
         return float(max(0, round((self.deadline - now) / max(pace, 1e-9))))
 
     def end_after(self, iteration: int, room: float) -> None:
-        """There was time for ``room`` more iterations after ``iteration``."""
+        """Set the last iteration: ``room`` iterations after ``iteration``, at most the requested one."""
         self.last = int(min(self._wanted, iteration + room))
 
 
 # ---- threads of an update on a CPU ----------------------------------------------------------------------------------
 
 
-# An update is some thousand small parallel regions, and each waits for its slowest thread. If another process takes a
-# core away, all threads wait for the scheduler, again and again: measured up to 60 times slower than one thread.
-_SLOW = 3.0  # ours: an update this many times slower than the one before starts a trial; noise stays below 2
-_GAIN = 1.2  # ours: the other number must be this many times faster to be chosen
-_PATIENCE = 50  # ours: updates on one thread before all cores are tried again; doubled each time that does not help
+# An update has about a thousand small parallel regions, and each waits for its slowest thread. If another process uses
+# one of the cores, all threads wait for it in each region: measured up to 60 times slower than one thread.
+_SLOW = 3.0  # ours: an update this many times slower than the previous one starts a trial; noise stays below 2
+_GAIN = 1.2  # ours: another number of threads is chosen if it is this many times faster
+_PATIENCE = 50  # ours: updates on one thread before a trial of all cores; doubled after a trial without gain
 
 
 class ThreadChoice:
-    """Chooses the number of threads of the next update by the durations of those before. No clock, no torch."""
+    """Chooses the number of threads of the next update by the durations of earlier ones. It reads no clock."""
 
     def __init__(self, few: int, many: int) -> None:
         self.few, self.many = few, many
-        self.settled = many  # the choice
-        self.threads = few  # of the next update: first the number that cannot be very slow
-        self._times: dict[int, float] = {}  # threads -> duration of the last update on as many [s]
+        self.settled = many  # the chosen number
+        self.threads = few  # number for the next update; first ``few``, which is never very slow
+        self._times: dict[int, float] = {}  # threads -> duration of the last update [s]
         self._warm, self._since, self._patience = False, 0, _PATIENCE
 
     def took(self, seconds: float) -> str:
-        """Note the duration of an update; returns a line for the user if the choice has changed, else ''."""
+        """Record the duration of an update. Returns a message if the choice changed, else ''."""
         if not self._warm:  # the first update also allocates
             self._warm = True
             return ""
@@ -620,16 +626,15 @@ class ThreadChoice:
 
 
 def better(times: dict[int, float], settled: int) -> int:
-    """``settled``, or another number of threads that is faster by ``_GAIN``."""
+    """The fastest number of threads if it is ``_GAIN`` times faster than ``settled``, else ``settled``."""
     quickest = min(times, key=lambda threads: times[threads])
     return quickest if _GAIN * times[quickest] < times[settled] else settled
 
 
 class UpdateThreads:
-    """Context of an update: torch's number of threads. A step's small operations want one thread, so it is restored.
+    """A context that sets torch's number of threads for an update and restores it: steps are fastest on one thread.
 
-    ``count`` 0: one thread or all ``cores``, whichever is faster; tried again when an update takes far longer than
-    usual.
+    With ``count`` 0 the number is 1 or ``cores``, whichever is faster. A much slower update starts a new trial.
     """
 
     def __init__(self, count: int, cores: int) -> None:

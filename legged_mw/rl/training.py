@@ -1,6 +1,6 @@
-"""The work of train.py: choose config and device, train, stop and resume, and tell the user how to go on.
+"""The work of train.py: choose config and device, train, stop, resume, and print the next command.
 
-The check of a task, the exam and the exporter are arguments, since none of them is part of the core.
+The check of a task, the exam and the exporter are arguments, because they are not part of the core.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ from legged_mw.utils.files import writable
 from legged_mw.utils.machine import settle, usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
-STOPPED = 3  # exit code of a training that ended early and can go on
-_STEPS_PER_CORE = 6500  # a second, in training with the default section `cpu` (docs/performance.md)
+STOPPED = 3  # exit code of a training that was stopped and can be resumed
+_STEPS_PER_CORE = 6500  # [steps/s] of a training with the default section `cpu` (docs/performance.md)
 
-# raises if the step cannot be recorded; returns a note on state of the task that no checkpoint holds, or ""
+# raises if the step cannot be recorded; returns a message on task state that checkpoints do not hold, or ""
 Check = Callable[[LoadedTask], str]
 Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
-Begun = Callable[[Runner, Path], None]  # with the run folder
-Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder -> line for the user
+Begun = Callable[[Runner, Path], None]  # runner, run folder
+Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder -> message
 
 
 class Start(NamedTuple):
-    """Where a training begins."""
+    """The run, checkpoint or policies that a training starts from."""
 
     experiment: Path  # folder for a new run
     run: Path | None = None  # the run to resume
@@ -75,13 +75,13 @@ class Start(NamedTuple):
     teacher: Trained | None = None  # the policy to distil
     policy: Trained | None = None  # a new run starts from its actor
 
-    goes_on: bool = False  # write into the folder of ``run``: the checkpoint is its newest
+    goes_on: bool = False  # write into the folder of ``run``, because the checkpoint is its newest
 
 
 def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
-    """Give ``task`` its final config, of the resumed run, the user and a CPU. Returns the start and the device."""
+    """Set the final config of ``task``: resumed run, CPU section, flags. Returns the start and the device."""
     if not torch.cuda.is_available():
-        torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
+        torch.set_num_threads(1)  # a step has hundreds of small operations, which are slow on several threads
     start = _resume(task, args) if args.resume else None
     apply_overrides(task, args)
     start = _find_others(task, start or Start(experiment_folder(task)))
@@ -94,7 +94,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if start.policy:
         task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
     if fitted or start.policy:
-        apply_overrides(task, args)  # again: flags win
+        apply_overrides(task, args)  # again, because flags win
     if this_rank().leads and not args.check:
         writable(str(start.run or start.experiment), "runs go to", folder=True)
     _note_others(task, start)
@@ -104,26 +104,26 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     task.train.check(task.cfg.env.num_envs)
     if device != "cpu":
         torch.cuda.set_device(device)
-    seed_everything(task.train.seed + rank.index)  # each rank draws its own worlds, commands and noise
+    seed_everything(task.train.seed + rank.index)  # each rank has its own worlds, commands and noise
     args.eager |= not _announce(task, device, rank, args.max_time)
     return start, device
 
 
 def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
-    """Find the run to resume and take its config."""
+    """Find the run to resume, and update ``task`` with its config."""
     experiment = experiment_folder(task, args.experiment_name)
     run = find_run(experiment, args.load_run or "-1")
     checkpoint, config = find_checkpoint(run, args.checkpoint), run / CONFIG_FILE
     start = Start(experiment, run, checkpoint, goes_on=checkpoint == find_checkpoint(run, -1))
     if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
-        _lock(start).release()  # raise now, not after the environment is made
+        _lock(start).release()  # raise before the environment is made
     for section in update_from_run(task, load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
 
 
 def _find_others(task: LoadedTask, start: Start) -> Start:
-    """Find teacher and warm start that the config names. The folder of a run holds a copy of its teacher."""
+    """Find the teacher and the warm start that the config names. A resumed run uses its copy of the teacher."""
     teacher, begin = task.train.distillation.teacher, task.train.warm_start.policy
     if teacher:
         teacher = str(start.run / TEACHER) if start.run else teacher
@@ -134,7 +134,7 @@ def _find_others(task: LoadedTask, start: Start) -> Start:
 
 
 def _note_others(task: LoadedTask, start: Start) -> None:
-    """Print which policies they are, and write it into the config."""
+    """Print teacher and warm start, and write their files into the config."""
     for trained, section, field in ((start.teacher, "distillation", "teacher"), (start.policy, "warm_start", "policy")):
         if trained and not start.run:
             file = shown(trained.source.checkpoint)
@@ -148,7 +148,7 @@ def _note_others(task: LoadedTask, start: Start) -> None:
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
-    """Print task, device, reasons for a low speed, on a CPU the duration. Returns whether steps can be recorded."""
+    """Print task, device, reasons for a low speed, and on a CPU the duration. Returns whether steps can be recorded."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
     print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
@@ -171,9 +171,9 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
 
 
 def advice_on_rate(task: LoadedTask) -> str:
-    """A warning for a recurrent network on a GPU: with many samples the adaptive learning rate rises too far for it.
+    """A warning for a recurrent network on a GPU: its adaptive learning rate becomes too high with many samples.
 
-    See docs/lab.md, Blind stairs.
+    Source: docs/lab.md, Blind stairs.
     """
     algorithm, networks = task.train.algorithm, (task.train.actor, task.train.critic)
     recurrent = any(network.class_name.endswith("RNNModel") for network in networks)
@@ -185,7 +185,7 @@ def advice_on_rate(task: LoadedTask) -> str:
 
 
 def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
-    """Context that prints a line if the start waits for kernels to compile."""
+    """A context that prints a line if kernels must be compiled."""
     return (
         device_facts(device).say_compiling()
         if pick_engine(task.cfg.sim.engine, device) == "mujoco_warp"
@@ -194,7 +194,7 @@ def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[objec
 
 
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check) -> Any:
-    """Make the environment. Raises if its step cannot be recorded (unless ``eager``) or learning cannot work in it."""
+    """Make the environment. Raises if its step cannot be recorded (unless ``eager``) or does not fit the learner."""
     lost = check(task) if this_rank().leads and (start.run or not eager) else ""
     env = task.env_class(task.cfg, device, eager=eager)
     env.not_remembered = lost
@@ -213,7 +213,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check
 
 
 def make_learner(task: LoadedTask, env: RobotTask, start: Start) -> Runner:
-    """Make the runner. A new run gets its teacher or warm start here, a resumed one its checkpoint in ``train``."""
+    """Make the runner. A new run loads its teacher or warm start here. ``train`` loads the checkpoint of a resume."""
     runner = make_runner(env, task.train, None, str(env.device), start.teacher.task.train if start.teacher else None)
     if not start.checkpoint:
         _begin(runner, start)
@@ -221,7 +221,7 @@ def make_learner(task: LoadedTask, env: RobotTask, start: Start) -> Runner:
 
 
 def wants_exam(task: LoadedTask) -> bool:
-    """Whether this process grades the policy during training."""
+    """Whether this process runs exams during training."""
     return this_rank().leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
 
 
@@ -237,14 +237,14 @@ def train(
 ) -> bool:
     """Train to the last iteration, to ``deadline`` [s, time.time()], or until stopped. Export if not stopped.
 
-    ``begun`` is called before the first iteration, when the run folder is written; ``verbose`` prints whole blocks.
-    Returns whether the training is finished.
+    ``begun`` is called before the first iteration, after the run folder is written; ``verbose`` prints all numbers.
+    Returns whether the training is finished. Raises UserError if it diverged or the last checkpoint was not written.
     """
     rank, runner = this_rank(), make_learner(task, env, start)
     env.fuse(task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
-        left = _load(runner, task, start)  # before the lock: a refusal writes nothing
+        left = _load(runner, task, start)  # before the lock, so that an error writes nothing
         lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
         _stop_on_signals(runner)
         leave_when_stuck(rank)
@@ -259,7 +259,7 @@ def train(
             raise UserError(error)
         if rank.leads and finished and task.train.runner.export:
             _export(task, folder, export)
-    return finished or rank.count > 1  # torchrun takes any exit code but 0 for a crash
+    return finished or rank.count > 1  # for torchrun any exit code but 0 is a crash
 
 
 def _not_saved(runner: Runner) -> str:
@@ -274,7 +274,7 @@ def _not_saved(runner: Runner) -> str:
 
 
 def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
-    """Load the checkpoint of a resumed run; returns how many iterations are left."""
+    """Load the checkpoint of a resumed run. Returns the number of iterations left."""
     if start.checkpoint:
         runner.load(str(start.checkpoint))
     done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
@@ -289,7 +289,7 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
 
 
 def _begin(runner: Runner, start: Start) -> None:
-    """Give a new run its teacher, or the actor of its warm start."""
+    """Load the teacher or the actor of the warm start of a new run."""
     if start.teacher:
         assert isinstance(runner.alg, Distillation)
         load_teacher(runner.alg.teacher, start.teacher, runner.env)
@@ -301,7 +301,7 @@ def _begin(runner: Runner, start: Start) -> None:
 
 
 def _lock(start: Start) -> RunLock:
-    """Lock the run to resume. Raises ConfigError if another process trains or has trained it, or it is read-only."""
+    """Lock the run to resume. Raises ConfigError if it is locked, read-only, or has a newer checkpoint."""
     assert start.run
     try:
         lock = RunLock(start.run)
@@ -319,10 +319,10 @@ def _lock(start: Start) -> RunLock:
 def _open_run(
     runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None
 ) -> Path:
-    """The folder that this training writes to, locked until ``held`` ends, with the config in it.
+    """Open the run folder and write the config into it. It stays locked until ``held`` ends.
 
-    It is the resumed run's if the ``lock`` is given, else a new one. The first rank makes it for all of them, and makes
-    it again if somebody deletes it.
+    With a ``lock`` it is the folder of the resumed run, else a new one. The first rank makes it for all ranks, also
+    again if it is deleted.
     """
     folder = [Path()]
     if start.run and lock:
@@ -359,7 +359,7 @@ def _open_run(
 
 
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
-    """Learn. Raises UserError if another rank is lost."""
+    """Run the iterations. Raises UserError if the connection to another rank is lost."""
     settle()
     try:
         with runner.console:
@@ -378,7 +378,7 @@ def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
 
 
 def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank) -> bool:
-    """Print the last exam and the next command; returns whether the training is finished."""
+    """Print the last exam and the next command. Returns whether the training is finished."""
     if runner.last_exam:
         iteration, figures = runner.last_exam
         said = ", ".join(f"{figure} {value:.3f}" for figure, value in figures.items())
@@ -397,37 +397,37 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
 
 
 def _flags(task: LoadedTask, folder: Path) -> str:
-    """The flags that name a run."""
+    """The flags that select a run."""
     name = task.name if task.ships else shown(task.path)
     home = experiment_folder(load_task(name))
     return shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
 
 
 def _export(task: LoadedTask, run: Path, export: Export) -> None:
-    """Export the trained policy. The training is saved, so an error of the exporter only prints a line."""
+    """Export the trained policy. The training is already saved, so an error is only printed."""
     folder = run / "export"
     try:
         print(export(task, find_checkpoint(run, -1), folder))
-    except Exception as error:  # of any kind
+    except Exception as error:  # any kind
         reason = " ".join(f"{error}".split()) or type(error).__name__
         print(f"not exported: {reason}\n  to try again: {command('play')} {_flags(task, run)} --export {shown(folder)}")
 
 
 def _stop_on_signals(runner: Runner) -> None:
-    """On Ctrl-C, SIGTERM and a hang-up, save and stop; a second Ctrl-C or SIGTERM stops at once.
+    """On Ctrl-C, SIGTERM and SIGHUP, save and stop. A second Ctrl-C or SIGTERM stops at once.
 
-    A second hang-up does nothing: when a terminal closes, the shell and the system send one each.
+    A second SIGHUP does nothing: when a terminal closes, the shell and the system each send one.
     """
 
     def stop(number: int, _: object) -> None:
         runner.stop = name = signal.Signals(number).name
-        # os.write: print must not be called while another print is interrupted
-        with suppress(OSError):  # the terminal may be gone
+        # os.write, because print fails if the signal interrupts another print
+        with suppress(OSError):  # the terminal may be closed
             again = "" if name == "SIGHUP" else "; again to stop at once"
             os.write(1, f"{name}: saving and stopping after this iteration{again}\n".encode())
         signal.signal(number, (lambda *_: None) if name == "SIGHUP" else signal.SIG_DFL)
 
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup ignores it
         signal.signal(signal.SIGHUP, stop)

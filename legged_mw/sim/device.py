@@ -1,4 +1,4 @@
-"""Facts of a device for messages: what CUDA supports, how much memory is taken, which kernels are compiled."""
+"""Facts of a device for messages: CUDA version, memory in use, compiled kernels."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from typing import NamedTuple
 
 import torch
 
-GRAPHS_SINCE = (12, 4)  # CUDA version of the driver; mujoco-warp warns that with older ones recording may be unreliable
-_OTHERS = 1.0  # GiB on a GPU: a desktop takes less, a training takes more
-# [s] between checks for newly compiled kernels; a start that compiles none ends before the first
+GRAPHS_SINCE = (12, 4)  # CUDA version of the driver; mujoco-warp warns that recording with older ones is unreliable
+_OTHERS = 1.0  # [GiB] on a GPU; a desktop uses less, a training uses more
+# [s] between checks for newly compiled kernels; a start without compilation ends before the first check
 _WAITS = (6.0, 6.0, 12.0)
 
 
 class DeviceFacts(NamedTuple):
-    """A device as warp sees it; memory in GiB."""
+    """Facts of a device; memory in GiB."""
 
     name: str
     cuda: tuple[int, int] | None  # version that the driver supports
     pool: bool  # memory can be allocated while a graph is recorded
     cache: Path  # folder of compiled kernels
-    compiled: int  # kernel modules in it for this device
+    compiled: int  # number of kernel modules in ``cache`` for this device
     memory: float = 0.0
-    taken: float = 0.0  # by all processes
-    binaries: str = ""  # pattern of the name of a compiled file
+    taken: float = 0.0  # memory in use by all processes
+    binaries: str = ""  # pattern of the names of compiled files
 
     def slow(self) -> list[str]:
-        """A line for each reason why the start, or the training, is slow here."""
+        """A message for each reason why the start or the training is slow on this device."""
         lines = []
         if not self.compiled:
             compiling = "some 50 modules of kernels are compiled at this first start, a minute or two"
@@ -46,13 +46,13 @@ class DeviceFacts(NamedTuple):
         return lines
 
     def compiled_since(self, begun: float) -> int:
-        """Number of kernel modules, of any package, compiled after ``begun`` (``time.time()``)."""
+        """Number of kernel modules of all packages compiled after ``begun`` [s, time.time()]."""
         files = self.cache.glob(f"wp_*/{self.binaries}")
         return len({file.parent for file in files if file.stat().st_mtime >= begun})
 
     @contextmanager
     def say_compiling(self, say: Callable[[str], object] = print, waits: Sequence[float] = _WAITS) -> Iterator[Thread]:
-        """While inside, a thread says once if kernels are being compiled. ``slow`` already reports an empty cache."""
+        """A context in which a thread prints once if kernels are compiled. ``slow`` reports an empty cache instead."""
         begun, over = time.time(), Event()
 
         def watch() -> None:
@@ -73,8 +73,8 @@ class DeviceFacts(NamedTuple):
 
 
 def device_facts(device: str) -> DeviceFacts:
-    """The facts of ``device``. Call it before this process allocates memory there, which would count as taken."""
-    import warp as wp  # here, because importing warp takes a second
+    """The facts of ``device``. Call it before this process allocates memory there: ``taken`` would include it."""
+    import warp as wp  # here, because importing warp takes about 1 s
 
     wp.config.log_level = wp.LOG_WARNING
     wp.init()

@@ -1,4 +1,4 @@
-"""Choose the engine: ``mujoco_warp`` on a GPU (slow on a CPU), or ``mujoco``, MuJoCo's own, on threads of a CPU."""
+"""Choose the engine: ``mujoco_warp`` on a GPU (slow on a CPU), or ``mujoco``, MuJoCo's own engine on CPU threads."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from legged_mw.utils.errors import EngineError, unknown
 from legged_mw.utils.machine import in_bytes, require_memory
 
 ENGINES = ("auto", "mujoco_warp", "mujoco")
-# Least bytes of a world, as a share of an MjData's. Measured on MuJoCo's own engine: 0.21 (Go1), 0.52 (G1), 1.3 (rough
-# ground); on mujoco-warp 1.1 and 1.3, without its buffers for contacts and rows.
+# Memory of a world / memory of an MjData, at least. Measured on MuJoCo's own engine: 0.21 (Go1), 0.52 (G1), 1.3 (rough
+# ground); on mujoco-warp: 1.1 and 1.3, without its buffers for contacts and rows.
 _SHARE = {"mujoco": 0.2, "mujoco_warp": 1.0}
 
 
 def pick_engine(name: str, device: str) -> str:
-    """Resolve "auto": MuJoCo's own engine on a CPU, mujoco-warp on a GPU. Raises EngineError if the two do not fit."""
+    """The engine for ``name``; "auto": MuJoCo's own on a CPU, mujoco-warp on a GPU. Raises EngineError."""
     if name not in ENGINES:
         raise EngineError(unknown("engine", name, ENGINES, "the list of engines"))
     if name == "auto":
@@ -45,10 +45,10 @@ def make_simulation(
 ) -> Simulation:
     """Allocate ``num_envs`` worlds of ``model`` on ``device``.
 
-    ``terrain``: source of the model's height field; on mujoco-warp our own contacts replace that field's.
+    ``terrain``: source of the model's height field; on mujoco-warp our own contacts replace those of the field.
     ``nconmax``, ``njmax``: contacts and constraint rows of a world on mujoco-warp; 0: counted (``sim/capacity.py``).
-    ``threads``: of MuJoCo's own engine; 0: one a core. ``world_fields``: model fields with a value per world (see
-    ``field``). ``eager``: mujoco-warp does not record its kernels on a CPU.
+    ``threads``: of MuJoCo's own engine; 0: one per core. ``world_fields``: model fields with a value per world (see
+    ``field``). ``eager``: do not record mujoco-warp's kernels on a CPU. Raises UserError if the memory is too small.
     """
     kind = pick_engine(engine, device)
     world, room = _SHARE[kind] * mujoco.MjData(model).nbuffer, ""
@@ -60,7 +60,7 @@ def make_simulation(
     require_memory(
         num_envs * world, device, f"num_envs = {num_envs}", f"a world takes {in_bytes(world)}{room}; take fewer"
     )
-    # imported here, because importing warp takes a second
+    # imported here, because importing warp takes about 1 s
     if kind == "mujoco":
         from legged_mw.sim.mujoco_engine import MujocoSimulation
 

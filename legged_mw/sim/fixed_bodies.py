@@ -1,4 +1,4 @@
-"""Bodies that do not move against each other: weld joints, fuse fixed links, give the IMU a site on the root."""
+"""Bodies without relative motion: weld held joints, fuse fixed links, add an IMU site on the root."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from legged_mw.sim.robot_file import RobotFile
 from legged_mw.utils.errors import ModelError, unknown
 
 _ALIGNED = 1e-4  # [rad] axes that differ by less are parallel
-_IMU = "imu"  # default name of the IMU's site
+_IMU = "imu"  # default name of the IMU site
 
 
 def match_joints(joints: Sequence[str], patterns: Sequence[str], what: str) -> list[str]:
-    """The joints that match a name or pattern, in the order of ``joints``."""
+    """The joints that match a name or pattern, in the order of ``joints``. Raises ModelError without a match."""
     for pattern in patterns:
         if not any(fnmatchcase(joint, pattern) for joint in joints):
             raise ModelError.of((what, unknown("joint", pattern, joints, "the MJCF")))
@@ -24,7 +24,7 @@ def match_joints(joints: Sequence[str], patterns: Sequence[str], what: str) -> l
 
 
 def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str, float], notes: list[str]) -> None:
-    """Weld each joint at its angle [rad]: turn its body, delete the joint. ``model`` is ``spec`` compiled."""
+    """Weld each joint at its angle [rad]: turn its body and delete the joint. ``model``: the compiled ``spec``."""
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     for name, angle in angles.items():
@@ -46,7 +46,7 @@ def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str,
 
 
 def _set_pose(body: mujoco.MjsBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Set the pose of ``body`` in its parent to that in ``data``, whichever attributes the file used for it."""
+    """Set the pose of ``body`` relative to its parent to the pose in ``data``."""
     here, parent = data.body(body.name), data.body(int(model.body(body.name).parentid[0]))
     back, away, quat, place = np.zeros(4), np.zeros(3), np.zeros(4), np.zeros(3)
     mujoco.mju_negPose(away, back, parent.xpos, parent.xquat)
@@ -57,7 +57,7 @@ def _set_pose(body: mujoco.MjsBody, model: mujoco.MjModel, data: mujoco.MjData) 
 
 
 def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Fuse bodies without a joint into the link that carries them, so that fewer bodies are stepped."""
+    """Fuse bodies without a joint into their parent link, so that fewer bodies are simulated."""
     fixed: dict[str, list[str]] = {}
     for body in spec.bodies:
         carrier = body
@@ -75,11 +75,11 @@ def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def sensed_site(robot: RobotFile, model: mujoco.MjModel, wanted: str) -> str:
-    """Name of a site on the root with the root's axes: ``wanted`` if it is one, else a new site at the same place.
+    """Name of a site on the root with the root's axes: ``wanted`` if it is one, else a new site at its position.
 
-    ``wanted`` is a site or a body (its origin) that is fixed to the root. If it is empty, the site "imu" is taken; if
-    that is missing or moves, the root's origin. ``model`` is the robot compiled.
-    Raises ModelError if ``wanted`` does not exist or moves against the root.
+    ``wanted``: a site, or a body (its origin), that is fixed to the root. Empty: the site "imu", or the root's origin
+    if that site is missing or not fixed to the root. ``model``: the compiled robot.
+    Raises ModelError if ``wanted`` does not exist or is not fixed to the root.
     """
     spec, root, name = robot.spec, robot.root, wanted or _IMU
     is_site = spec.site(name) is not None

@@ -1,4 +1,4 @@
-"""Find geoms by name: a geom, a body (all its colliding geoms), or a pattern of either with * and ?."""
+"""Find geoms by the name of a geom, the name of a body (all its colliding geoms), or a pattern with * and ?."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from legged_mw.utils.errors import ModelError, unknown
 
 @dataclass(frozen=True)
 class GeomNames:
-    """Names of a robot's geoms and bodies in its file, also of bodies that are fused later."""
+    """Names of the geoms and bodies in a robot's file, including bodies that are fused later."""
 
-    where: str  # the file
-    geoms: tuple[str, ...]  # with a name
-    colliding: tuple[str, ...]  # of these, those that may touch
-    bodies: dict[str, tuple[str, ...]]  # body -> its colliding geoms; if it has none, those of bodies fixed to it
-    lost: Mapping[str, str]  # of ``RobotFile``
+    where: str  # name of the file
+    geoms: tuple[str, ...]  # all geoms with a name
+    colliding: tuple[str, ...]  # geoms that may collide
+    bodies: dict[str, tuple[str, ...]]  # body -> its colliding geoms; without any, those of bodies fixed to it
+    lost: Mapping[str, str]  # ``RobotFile.lost``
 
     def find(self, patterns: Sequence[str], what: str, colliding: bool = False) -> tuple[str, ...]:
-        """The geoms that match ``patterns``, each once, in their order; with ``colliding`` only those that may touch.
+        """The geoms that match ``patterns``, each once, in their order; with ``colliding`` only colliding ones.
 
-        A geom wins over a body of the same name. ``what`` names the caller's parameter in a ModelError. A pattern with
-        * or ? passes over what is ``lost``.
+        A name is first looked up among geoms, then among bodies. ``what``: name of the caller's parameter, for a
+        ModelError. A pattern with * or ? does not need to match ``lost`` colliders.
         """
         found: dict[str, None] = {}
         geoms = self.colliding if colliding else self.geoms
@@ -41,12 +41,12 @@ class GeomNames:
         return tuple(found)
 
     def passed_over(self, patterns: Sequence[str]) -> list[str]:
-        """A warning for each ``lost`` collider that a pattern of ``patterns`` fits."""
+        """A warning for each ``lost`` collider that matches one of ``patterns``."""
         fitting = [text for name, text in self.lost.items() if any(fnmatchcase(name, pattern) for pattern in patterns)]
         return [f"warning: {text}" for text in dict.fromkeys(fitting)]
 
     def _no_geom(self, pattern: str, geoms: Sequence[str], bodies: Sequence[str], colliding: bool) -> str:
-        """Why ``pattern`` has no geom, though it matches ``bodies``."""
+        """Message for a ``pattern`` that matches no geom. ``bodies``: the bodies that it matches."""
         if bodies:
             have = ", ".join(name for name, own in self.bodies.items() if own) or "none"
             return f"body '{bodies[0]}' of {self.where} has no geom that collides; bodies that have: {have}"
@@ -56,7 +56,7 @@ class GeomNames:
 
 
 def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str], lost: Mapping[str, str]) -> GeomNames:
-    """Name the unnamed colliding geoms ``<body>_<number>``, and list all names."""
+    """Give unnamed colliding geoms the name ``<body>_<number>``, and collect all names."""
     taken = {geom.name for geom in spec.geoms}
     for body in spec.bodies:
         for number, geom in enumerate(body.geoms):
@@ -83,6 +83,6 @@ def _own(body: mujoco.MjsBody) -> list[str]:
 
 
 def _fixed_to(body: mujoco.MjsBody) -> list[str]:
-    """Colliding geoms of the bodies that are fixed to ``body``."""
+    """Names of the colliding geoms of bodies that are fixed to ``body``."""
     fixed = [child for child in body.bodies if not child.joints]
     return [name for child in fixed for name in (*_own(child), *_fixed_to(child))]

@@ -1,4 +1,4 @@
-"""Record a fixed sequence of work once, and replay it as a CUDA graph."""
+"""Record a function once as a CUDA graph, and replay it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from legged_mw.utils.errors import NotRecordable, line_to_blame, out_of_memory
 
 
 class StepGraph:
-    """Calls ``fn``; on a GPU every call after the first three replays one CUDA graph of torch and warp work together.
+    """Calls ``fn``. On a GPU every call after the first three replays one CUDA graph of its torch and warp kernels.
 
-    ``fn`` may only write tensors in place that outlive it, and may not copy a value to the host.
-    The first calls are real ones: they compile kernels and warm the allocators, and no step is wasted.
+    ``fn`` may only write in place to tensors that exist after the call, and may not copy values to the host. The first
+    calls run ``fn`` without a graph, which compiles kernels and fills the allocators.
     """
 
-    # called once, before recording; returns a function that does the same in fewer kernels
+    # called once before recording; returns a function with the same results and fewer kernels
     better: Callable[[], Callable[[], None]] | None = None
 
     def __init__(self, fn: Callable[[], None], device: str, eager: bool = False, warmup: int = 3) -> None:
@@ -28,11 +28,11 @@ class StepGraph:
 
     @property
     def recorded(self) -> bool:
-        """Whether calls are replays now."""
+        """Whether calls replay the graph."""
         return self._graph is not None
 
     def improve(self, fn: Callable[[], None]) -> None:
-        """Replace the function by ``fn``, which does the same."""
+        """Replace the function by ``fn``, which must have the same results."""
         self._fn = fn
 
     def __call__(self) -> None:
@@ -44,10 +44,10 @@ class StepGraph:
             self._first_calls(self._stream)
 
     def _first_calls(self, stream: torch.cuda.Stream) -> None:
-        """Run eagerly while warming up, then record and replay; all on one side stream, as capture requires."""
-        import warp as wp  # a second to import, and only for a GPU
+        """Run without a graph for warm-up, then record and replay; all on one side stream, as CUDA capture requires."""
+        import warp as wp  # here, because the import takes about 1 s and only a GPU needs it
 
-        wp.init()  # no effect if a simulation did so
+        wp.init()  # no effect if a simulation has called it
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
         wp_stream = wp.stream_from_torch(stream)
@@ -65,9 +65,9 @@ class StepGraph:
         self._graph.replay()
 
     def _record(self, stream: torch.cuda.Stream, wp: Any, wp_stream: Any) -> torch.cuda.CUDAGraph:
-        """The graph of one call. Raises NotRecordable with the line of ``fn`` that failed, not a later error."""
+        """Record one call. Raises NotRecordable with the line of ``fn`` that failed first."""
         graph, failed, collects = torch.cuda.CUDAGraph(), None, gc.isenabled()
-        gc.disable()  # freeing an older graph would abort the recording
+        gc.disable()  # the deletion of another graph would abort the recording
         try:
             with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
                 wp.capture_begin(stream=wp_stream, external=True)

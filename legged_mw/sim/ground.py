@@ -13,19 +13,19 @@ import numpy as np
 from legged_mw.sim.terrain import LEVEL, Heights, Terrain
 
 GROUND = "floor"  # name of the ground geom
-PROBE_SPACING = 0.1  # [m] between the spheres by which one geom touches terrain on mujoco-warp
-MOST_BOXES = 1000  # a tile that needs more stays a height field
+PROBE_SPACING = 0.1  # [m] between the contact spheres of a geom on terrain, on mujoco-warp
+MOST_BOXES = 1000  # largest number of boxes of a tile; a tile that needs more stays a height field
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane z = 0, or a height field. Its contact parameters win over the geom's that touches it (priority 1)."""
+    """The plane z = 0, or a height field. Contacts use its parameters, not those of the other geom (priority 1)."""
 
     friction: float = 0.6  # sliding [-]
-    condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
+    condim: int = 3  # 1 frictionless, 3 sliding, 4 also torsional, 6 also rolling
     terrain: Terrain | None = None  # None: the plane
-    boxes: bool = False  # level pieces of the terrain become boxes in the physics: for MuJoCo's own engine
-    slope: float = 0.0  # [deg] by which gravity leans from -z to x, as on a plane that slopes down along x
+    boxes: bool = False  # replace level pieces of the terrain by boxes, for MuJoCo's own engine
+    slope: float = 0.0  # [deg] angle of gravity from -z towards x, as on a plane that slopes down along x
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
@@ -47,15 +47,15 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
 
 
 def leaning(gravity: Sequence[float], slope: float) -> list[float]:
-    """``gravity`` (3,) in the axes of a plane that slopes down along x by ``slope`` [deg]."""
+    """``gravity`` (3,) in the frame of a plane that slopes down along x by ``slope`` [deg]."""
     size, angle = float(np.linalg.norm(gravity)), math.radians(slope)
     return [size * math.sin(angle), 0.0, -size * math.cos(angle)]
 
 
 def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) -> None:
-    """Put ``heights`` (R, C) [m] on the grid of ``terrain``."""
+    """Write ``heights`` (R, C) [m], on the grid of ``terrain``, into the height field of ``spec``."""
     low, (rows, columns) = float(heights.min()), heights.shape
-    span = max(float(np.ptp(heights)), 1e-3)  # MuJoCo scales the heights to 0..1, and needs a span above 0
+    span = max(float(np.ptp(heights)), 1e-3)  # MuJoCo scales the heights to 0..1 and requires a span above 0
     field = spec.hfield(GROUND)
     field.size = [(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, span, 1.0]
     field.userdata = ((heights - low) / span).astype(np.float32).ravel()
@@ -63,10 +63,10 @@ def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) 
 
 
 def replace_level_pieces(spec: mujoco.MjSpec, terrain: Terrain, notes: list[str]) -> None:
-    """Replace the level pieces of the height field by boxes, and sink the field under them.
+    """Replace the level pieces of the height field by boxes, and lower the field under them.
 
-    On a height field MuJoCo makes a tilted contact with every triangle near a geom, up to a dozen for a small sphere.
-    Few solver iterations leave them far from solved.
+    On a height field MuJoCo makes a tilted contact with every triangle near a geom, up to 12 for a small sphere. With
+    few iterations the solver does not converge for them.
     """
     boxes, heights, _ = as_boxes(terrain)
     _fill_height_field(spec, terrain, heights)
@@ -91,27 +91,27 @@ def add_ground_box(spec: mujoco.MjSpec, low: np.ndarray, high: np.ndarray) -> mu
 
 
 def feel_all_ground(spec: mujoco.MjSpec) -> None:
-    """Let sensors of contact with the ground's geom sense all geoms of the world body."""
+    """Let contact sensors of the ground geom sense all geoms of the world body."""
     for sensor in spec.sensors:
         if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.refname == GROUND:
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
 
 
-# ---- level pieces of a terrain as boxes: with a box MuJoCo makes one upright contact
+# ---- level pieces of a terrain as boxes: MuJoCo's contacts with the top of a box are vertical
 
 
 class Box(NamedTuple):
     """A block of ground with a level top."""
 
-    low: tuple[float, float]  # corner x, y [m, world]
-    high: tuple[float, float]  # the opposite one
-    top: float  # [m]
+    low: tuple[float, float]  # corner with the lowest x, y [m, world]
+    high: tuple[float, float]  # opposite corner [m, world]
+    top: float  # height [m]
 
 
 def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
-    """Boxes for tiles of few level pieces; the heights, 1 m lower under the boxes; the kinds that stay a height field.
+    """Boxes for tiles with few level pieces; the heights, 1 m lower under boxes; the kinds that stay a height field.
 
-    A box ends midway between two vertices, where the height field has a slope of one cell.
+    A box ends in the middle between two vertices. There the height field has a slope of one cell's width.
     """
     heights, boxes, left = terrain.heights.copy(), [], set()
     n = round(terrain.tile / terrain.cell)
@@ -133,7 +133,7 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
 
 
 def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
-    """Rectangles of vertices of equal height: (rows, columns, height), spans half open. It stops above MOST_BOXES."""
+    """Rectangles of vertices with equal height: (rows, columns, height), half-open spans; stops above MOST_BOXES."""
     taken = np.zeros(patch.shape, dtype=bool)
     pieces: list[tuple[tuple[int, int], tuple[int, int], float]] = []
     for row in range(patch.shape[0]):

@@ -1,16 +1,16 @@
-"""Contacts with a height field, and its heights, in warp. One kernel makes them, in mujoco-warp's contact filter.
+"""Warp kernels for a height field: its heights, and its contacts, which mujoco-warp's contact filter makes.
 
-mujoco-warp 4.0.0 treats a height field as many prisms. A sphere gets a contact from every triangle near it, tilted ones
-at edges inside a plane, and sometimes a deep one that is false (figures in docs/terrain.md). Here a sphere touches the
-surface at its nearest point, and at a second point on a face that turns away from the first, as in the corner of a
-step. A geom is sampled by probes, which are spheres fixed to it.
+mujoco-warp 4.0.0 treats a height field as many prisms. A sphere gets a contact from every near triangle, tilted ones at
+edges inside a plane, and sometimes a false deep contact (figures in docs/terrain.md). Here a sphere has a contact at
+the nearest point of the surface, and a second one on a face with another direction, as in the corner of a step. The
+contacts of a geom are those of its probes, which are spheres fixed to it.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportAssignmentType=false
 # pyright: reportOperatorIssue=false, reportReturnType=false
 # ruff: noqa: UP018, SIM102
-# (warp compiles this file as its own language: float() makes a variable)
+# (warp compiles the kernels as its own language, in which float() makes a variable)
 from __future__ import annotations
 
 import dataclasses
@@ -34,14 +34,14 @@ from legged_mw.utils.opaque import not_traced
 
 wp.set_module_options({"enable_backward": False})
 
-_CORNER_COS = wp.constant(0.9)  # faces that turn by more than this angle, 26 deg, make two contacts
-_DEEPEST = wp.constant(0.3)  # [m] around a probe under the ground in which the surface is searched
+_CORNER_COS = wp.constant(0.9)  # two faces with a larger angle between them than this, 26 deg, give two contacts
+_DEEPEST = wp.constant(0.3)  # [m] search radius for the surface around a probe under the ground
 
 
 def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, list[float]]:
-    """Spheres on the geoms that can touch the geom ``ground``: geoms, places in the geom's frame (P, 3), radii [m].
+    """Spheres on the geoms that can touch the geom ``ground``: geoms, centres (P, 3) [m, geom frame], radii [m].
 
-    They are at most ``PROBE_SPACING`` apart; a thin edge of the ground may enter a geom between two by as much.
+    Their distance is at most ``PROBE_SPACING``. A thin edge of the ground may enter a geom between two by as much.
     """
     geoms, places, radii = [], [], []
     for geom in range(model.ngeom):
@@ -66,7 +66,7 @@ def _field(terrain: Terrain) -> Any:
 
 
 class HeightLookup:
-    """``height_map.HeightMap`` as one kernel for a GPU, where many small operations are slow."""
+    """``height_map.HeightMap`` as one kernel, which is faster on a GPU."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
         self._device = wp.get_device(device)
@@ -75,7 +75,7 @@ class HeightLookup:
 
     @not_traced
     def __call__(self, points: Tensor) -> Tensor:
-        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field its rim's."""
+        """Ground height [m] at ``points`` (..., 2) [m, world]; outside of the field the height of its edge."""
         heights = torch.empty(points.shape[:-1], device=points.device)
         places = wp.from_torch(points.reshape(-1, 2), dtype=wp.vec2)
         wp.launch(
@@ -89,7 +89,7 @@ class HeightLookup:
 
 
 def touch_ground(model: mujoco.MjModel, ground: int, terrain: Terrain) -> Callable[[mjw.Model, mjw.Data], None]:
-    """The ``Model.callback.contactfilter``, on the current device. The geom ``ground`` itself must not collide."""
+    """The ``Model.callback.contactfilter`` on the current device. The geom ``ground`` must not collide in MuJoCo."""
     geoms, places, radii = probes(model, ground)
     field, spheres = _field(terrain), _Probes()
     spheres.geom, spheres.place, spheres.radius = (
@@ -122,7 +122,7 @@ class _Probes:
 
 
 def _struct(source: type, names: str) -> Any:
-    """Bundle arrays of a mujoco-warp dataclass into one kernel argument, with their names and types."""
+    """A warp struct for arrays of a mujoco-warp dataclass, with their names and types."""
     kinds = {field.name: field.type for field in dataclasses.fields(source)}
     return wp.struct(
         type(f"_{source.__name__}", (), {"__annotations__": {name: kinds[name] for name in names.split()}})
@@ -142,7 +142,7 @@ _Contacts = _struct(
 
 
 def _gather(struct: Any, source: Any) -> Any:
-    """A ``struct`` with the arrays of ``source``, not copied."""
+    """A ``struct`` with the arrays of ``source``, without copies."""
     gathered = struct()
     for name in struct.vars:
         setattr(gathered, name, getattr(source, name))
@@ -157,7 +157,7 @@ def _vertex(field: _Field, row: int, column: int) -> wp.vec3:
 
 @wp.func
 def _surface(field: _Field, u: float, v: float) -> float:
-    """Height [m] at column u, row v, on the triangles of ``HeightMap``; any height if u or v is not finite."""
+    """Height [m] at column u, row v, on the triangles of ``HeightMap``; undefined if u or v is not finite."""
     column = wp.clamp(int(wp.floor(u)), 0, field.heights.shape[1] - 2)
     row = wp.clamp(int(wp.floor(v)), 0, field.heights.shape[0] - 2)
     across, along = wp.clamp(u - float(column), 0.0, 1.0), wp.clamp(v - float(row), 0.0, 1.0)
@@ -203,7 +203,7 @@ def _nearest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.v
 
 @wp.func
 def _over_triangle(p: wp.vec3, n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
-    """Whether p, moved along the normal n, meets the triangle a, b, c (counterclockwise seen from above)."""
+    """Whether the line through p along the normal n meets the triangle a, b, c (counterclockwise from above)."""
     return (
         wp.dot(wp.cross(b - a, p - a), n) >= 0.0
         and wp.dot(wp.cross(c - b, p - b), n) >= 0.0
@@ -225,7 +225,7 @@ def _around(field: _Field, u: float, v: float, reach: float) -> wp.vec4i:
 
 @wp.func
 def _nearest(field: _Field, cells: wp.vec4i, centre: wp.vec3, lowest: float) -> tuple[wp.vec3, float, wp.vec3]:
-    """The surface's nearest point, its distance [m] and its face's normal; cells below ``lowest`` are skipped."""
+    """Nearest point of the surface, its distance [m] and the normal of its face; cells below ``lowest`` are skipped."""
     nearest, distance, up = wp.vec3(0.0, 0.0, 0.0), float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
     for row in range(cells[0], cells[1] + 1):
         for column in range(cells[2], cells[3] + 1):
@@ -244,7 +244,7 @@ def _nearest(field: _Field, cells: wp.vec4i, centre: wp.vec3, lowest: float) -> 
 
 @wp.func
 def _other_face(field: _Field, cells: wp.vec4i, centre: wp.vec3, normal: wp.vec3) -> tuple[float, wp.vec3]:
-    """Distance [m] and normal of the nearest face that turns away from ``normal`` and has the centre right above it."""
+    """Distance [m] and normal of the nearest face below the centre whose normal differs from ``normal``."""
     nearest, direction = float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
     for row in range(cells[0], cells[1] + 1):
         for column in range(cells[2], cells[3] + 1):
@@ -273,7 +273,7 @@ def _write(
     out: _Contacts,
     nacon: wp.array[int],
 ):
-    """Write one contact, with parameters mixed by MuJoCo's rules."""
+    """Write one contact, with parameters combined by MuJoCo's rules."""
     allowance = _margin_and_gap(m, geoms, world)
     # fmt: off
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
@@ -292,7 +292,7 @@ def _write(
 
 @wp.func
 def _margin_and_gap(m: _Material, geoms: wp.vec2i, world: int) -> wp.vec2:
-    """Margin and gap of a pair [m]."""
+    """Margin and gap of a pair of geoms [m]."""
     margins, gaps = m.geom_margin[world % m.geom_margin.shape[0]], m.geom_gap[world % m.geom_gap.shape[0]]
     return wp.vec2(margins[geoms[0]] + margins[geoms[1]], gaps[geoms[0]] + gaps[geoms[1]])
 
@@ -314,25 +314,25 @@ def _touch(
     geoms = wp.vec2i(ground, geom)
     centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ spheres.place[probe]
     allowance = _margin_and_gap(material, geoms, world)
-    farthest = allowance[0] + allowance[1]  # [m] from the surface up to which there is a contact
+    farthest = allowance[0] + allowance[1]  # [m] largest distance of a contact
     u, v = (centre[0] - field.corner[0]) * field.per_cell, (centre[1] - field.corner[1]) * field.per_cell
-    above = centre[2] - _surface(field, u, v)  # [m] straight up from the ground; negative: under it
+    above = centre[2] - _surface(field, u, v)  # [m] vertical distance from the ground; negative under it
     touching = radius + farthest
     cells = _around(field, u, v, wp.clamp(-above, touching, wp.max(touching, _DEEPEST)) * field.per_cell)
     nearest, distance, up = _nearest(field, cells, centre, centre[2] - touching)
     side = wp.where(above < 0.0, -1.0, 1.0)
-    depth = side * distance - radius  # [m] negative where it penetrates
+    depth = side * distance - radius  # [m] negative if it penetrates
     if distance > 1.0e8 or depth >= farthest:
         return
     normal = up
     if distance > 1.0e-6:
         away = side * (centre - nearest) / distance
-        # over a face its own normal is more exact than a difference of places
+        # above a face its normal is more exact than a difference of positions
         if wp.dot(away, up) < 0.9999:
             normal = away
     place = centre - normal * (radius + 0.5 * depth)
     _write(world, 0, geoms, depth, place, normal, material, naconmax, contacts, nacon)
-    if above >= 0.0:  # under the ground one contact is enough to push it out
+    if above >= 0.0:  # a probe under the ground needs only one contact
         other, face = _other_face(field, cells, centre, normal)
         depth = other - radius
         if depth < farthest:

@@ -1,7 +1,7 @@
-"""The joints of a robot: which of them move, their pose, and tables with a number for each.
+"""The joints of a robot: held and moving joints, their pose, and tables with a value per joint.
 
-A table maps keys to numbers. A joint's number is that of its exact name, else of the longest key that is part of its
-name, else of "".
+A table maps keys to values. The value of a joint is that of the key equal to its name, else of the longest key that is
+part of its name, else of "".
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from legged_mw.sim.fixed_bodies import hold_joints, match_joints
 from legged_mw.sim.robot_file import Range, RobotFile
 from legged_mw.utils.errors import ModelError, unknown
 
-_BEYOND = 1e-3  # [rad] by which rounding may put a pose outside of a range
-PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
+_BEYOND = 1e-3  # [rad] allowed rounding error of a pose outside of a range
+PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that may omit joints
 
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # position [m] and quaternion wxyz of a root
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # position [m] and quaternion wxyz of an upright root
 _SIDES = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br"}
 _SIDES |= {"front", "rear", "hind", "back"}
 
@@ -30,9 +30,9 @@ _SIDES |= {"front", "rear", "hind", "back"}
 def some_joints(
     table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()
 ) -> dict[str, float]:
-    """Joint -> value, for those of ``joints`` that a key fits. A key fits if it is the joint's name or a part of it.
+    """Joint -> value, for ``joints`` with a fitting key. A key fits if it is the joint's name or a part of it.
 
-    Raises ModelError for a key that fits neither ``joints`` nor ``spare``, and for two keys that fit equally well.
+    Raises ModelError for a key that fits neither ``joints`` nor ``spare``, and for two fitting keys of equal length.
     """
     for key in table:
         if key and not any(key in joint for joint in (*joints, *spare)):
@@ -50,7 +50,7 @@ def some_joints(
 
 
 def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()) -> list[float]:
-    """Values (D,) for ``joints``. Raises ModelError for joints without a key, and as ``some_joints`` does."""
+    """Values (D,) of ``joints``. Raises ModelError for joints without a key, and as ``some_joints``."""
     found = some_joints(table, joints, what, spare)
     if without := [joint for joint in joints if joint not in found]:
         missing = f"no value for {', '.join(without)}: none of {list(table)} is a part of these names"
@@ -61,7 +61,7 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spar
 def per_joint_all(
     tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()
 ) -> dict[str, list[float]]:
-    """``per_joint`` of several tables (name -> table). One error lists the mistakes of all of them."""
+    """``per_joint`` for several tables (name -> table). One ModelError lists the faults of all tables."""
     values, wrong = dict[str, list[float]](), list[tuple[str, str]]()
     for what, table in tables.items():
         try:
@@ -74,7 +74,7 @@ def per_joint_all(
 
 
 def family(name: str) -> str:
-    """A joint's name without its side and "joint": "FR_hip_joint" -> "hip"; the whole name if nothing is left."""
+    """A joint's name without its side and "joint": "FR_hip_joint" -> "hip"; if nothing is left, the whole name."""
     return "_".join(part for part in name.split("_") if part.lower() not in _SIDES) or name
 
 
@@ -83,23 +83,23 @@ def family(name: str) -> str:
 
 @dataclass(frozen=True)
 class PosedRobot:
-    """The D joints that move, their pose and their numbers; the others are welded."""
+    """The D moving joints, their pose and their values; the other joints are welded."""
 
-    model: mujoco.MjModel  # the robot alone, compiled, its held joints welded
+    model: mujoco.MjModel  # the compiled robot without ground, with its held joints welded
     joints: list[str]  # D
     held: list[str]
-    angles: list[float]  # D, the pose [rad]
-    ranges: list[Range]  # D [rad]; infinite where there is no limit
-    tables: dict[str, list[float]]  # D each: "stiffness" [N m/rad], "damping" [N m s/rad], and the caller's others
+    angles: list[float]  # (D,) the pose [rad]
+    ranges: list[Range]  # (D,) [rad]; infinite without a limit
+    tables: dict[str, list[float]]  # (D,) each: "stiffness" [N m/rad], "damping" [N m s/rad], and the caller's tables
 
 
 def pose_joints(
     robot: RobotFile, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
 ) -> PosedRobot:
-    """Weld the ``held`` joints, and give the others their numbers from ``tables`` (name -> table).
+    """Weld the ``held`` joints, and compute the values of the others from ``tables`` (name -> table).
 
     A joint's angle comes from ``pose``, else from the keyframe, else it is 0 (held joints, or ``pose`` is None).
-    Raises ModelError for joints that no key fits.
+    Raises ModelError for joints without a fitting key.
     """
     every = [joint.name for joint in robot.joints]
     welded = match_joints(every, held, "held_joints")
@@ -130,7 +130,7 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
 
 
 def posed(model: mujoco.MjModel, joints: Iterable[float], root: Iterable[float] = _UPRIGHT) -> mujoco.MjData:
-    """Kinematics of ``model`` with the joints at ``joints`` (D,) [rad] and the root at ``root`` (7,)."""
+    """Kinematics of ``model`` with joint angles ``joints`` (D,) [rad] and the root pose ``root`` (7,) [m, wxyz]."""
     data = mujoco.MjData(model)
     data.qpos[:] = [*root, *joints]
     mujoco.mj_kinematics(model, data)

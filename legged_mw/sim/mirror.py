@@ -1,6 +1,6 @@
-"""Find the mirror partner of each joint and site: its counterpart on the other side of the root's x-z plane.
+"""Find the mirror partner of each joint and site: the one on the other side of the root's x-z plane.
 
-Only geometry is compared: masses may differ.
+Only geometry is compared; masses may differ.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
 from legged_mw.utils.errors import ModelError
 
-_POLAR = np.array([1.0, -1.0, 1.0])  # mirrors polar vectors, such as places; axial ones, such as joint axes: -_POLAR
-_TOLERANCE = 0.001  # [m] between a mirrored place and its partner's
-_AXIS_TOLERANCE = 0.01  # [rad] between a mirrored axis and its partner's
+_POLAR = np.array([1.0, -1.0, 1.0])  # factor for polar vectors, such as positions; for axial ones (joint axes): -_POLAR
+_TOLERANCE = 0.001  # [m] allowed distance between a mirrored position and that of its partner
+_AXIS_TOLERANCE = 0.01  # [rad] allowed angle between a mirrored axis and that of its partner
 
 
 @dataclass(frozen=True)
 class Partners:
-    """A mirrored state is ``q[..., joints] * signs`` and ``site[..., sites]``; mirroring twice gives the state back."""
+    """The mirrored state is ``q[..., joints] * signs`` and ``site[..., sites]``. Applied twice it gives the state."""
 
-    joints: tuple[int, ...]  # D, in order of RobotModel.joint_names; a joint in the middle is its own partner
-    signs: tuple[int, ...]  # D, +1 or -1: the direction of the mirrored joint along its partner's axis
-    sites: tuple[int, ...]  # in order of ``sites``
+    joints: tuple[int, ...]  # (D,) in order of RobotModel.joint_names; a joint in the middle is its own partner
+    signs: tuple[int, ...]  # (D,) +1 or -1: direction of the mirrored joint along its partner's axis
+    sites: tuple[int, ...]  # in the order of ``sites``
 
 
 def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float = _TOLERANCE) -> Partners:
-    """Pair joints and ``sites`` by their places [m] and axes with all joints at zero.
+    """Find partners of joints and ``sites`` by positions [m] and axes with all joints at zero.
 
     Raises ModelError for a joint or site without a partner.
     """
     model, names = robot.physics, robot.joint_names
-    data = posed(model, np.zeros(len(names)))  # about zero angles q -> sign * q is the mirror image
+    data = posed(model, np.zeros(len(names)))  # with symmetric zero angles the mirror image is q -> sign * q
     joint_ids, site_ids = [model.joint(name).id for name in names], [robot.id("site", name) for name in sites]
     axes = data.xaxis[joint_ids]  # (D, 3), root frame
     slides = model.jnt_type[joint_ids] == mujoco.mjtJoint.mjJNT_SLIDE
     images = np.where(slides[:, None], axes * _POLAR, axes * -_POLAR)  # mirrored axes
-    signs = np.where(images @ axes.T < 0.0, -1, 1)  # (D, D) of the mirrored joint i along joint j
-    bends = np.linalg.norm(signs[..., None] * axes[None] - images[:, None], axis=-1)  # (D, D), about the angle [rad]
-    bends[slides[:, None] != slides[None]] = np.pi  # a hinge never mirrors a slide
+    signs = np.where(images @ axes.T < 0.0, -1, 1)  # (D, D) sign of the mirrored joint i along joint j
+    bends = np.linalg.norm(signs[..., None] * axes[None] - images[:, None], axis=-1)  # (D, D) approximate angle [rad]
+    bends[slides[:, None] != slides[None]] = np.pi  # a hinge and a slide are never partners
     kinds = np.where(slides, "slide", "hinge")
     found, wanted = (
         [f" with {kind} axis {_numbers(axis)}" for kind, axis in zip(kinds, of, strict=True)] for of in (axes, images)
@@ -57,7 +57,7 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
 
 
 def opposites(robot: RobotModel, name: str, tolerance: float = _TOLERANCE) -> list[str]:
-    """Names of the sites, geoms and bodies at the mirror image of ``name``, within ``tolerance`` [m]."""
+    """Names of the sites, geoms and bodies within ``tolerance`` [m] of the mirror image of ``name``."""
     model, found = robot.physics, []
     data = posed(model, np.zeros(len(robot.joint_names)))
     for kind, places in (("site", data.site_xpos), ("geom", data.geom_xpos), ("body", data.xpos)):
@@ -74,16 +74,16 @@ def _pair(
     places: np.ndarray,  # (n, 3) [m], root frame
     bends: np.ndarray,  # (n, n) [rad] between the mirrored axis of i and that of j
     tolerance: float,  # [m]
-    found: Sequence[str],  # for the error: a phrase about each one, and about its mirror image
+    found: Sequence[str],  # texts for the error: on each one, and (``wanted``) on its mirror image
     wanted: Sequence[str],
 ) -> tuple[int, ...]:
-    """For each place the index of the nearest one to its mirror image."""
+    """For each position the index of the one nearest to its mirror image. Raises ModelError."""
     gaps = np.linalg.norm(places[None] - (places * _POLAR)[:, None], axis=-1)  # (n, n) [m]
     fits = (bends <= _AXIS_TOLERANCE) & (gaps <= tolerance)
     root, within = robot.root, f"{1000 * tolerance:g} mm"
     for i, name in enumerate(names):
         if not fits[i].any():
-            near = np.lexsort((bends[i], gaps[i].round(6)))[0]  # of equally near ones, that with the nearest axis
+            near = np.lexsort((bends[i], gaps[i].round(6)))[0]  # nearest position, then nearest axis
             limit = f" and {_AXIS_TOLERANCE:g} rad, whichever way the axis points" if what == "joint" else ""
             mirrored, nearest = _numbers(places[i] * _POLAR), _numbers(places[near])
             raise ModelError(

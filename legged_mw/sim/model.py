@@ -1,8 +1,8 @@
-"""Compile a robot's file into a model with ground, motors and sensors. Host only; nothing is stepped.
+"""Compile a robot's file into a model with ground, motors and sensors, on the host.
 
-The file states facts of the machine (mass, geometry, joint range, armature, friction, force limit). The caller chooses
-gains, ground, colliders and sensors; every name in a choice must exist in the file. ``RobotModel.overrides`` lists all
-that a choice changes.
+The file has the facts of the machine (mass, geometry, joint range, armature, friction, force limit). The caller chooses
+gains, ground, colliders and sensors. Every name that the caller uses must exist in the file. ``RobotModel.overrides``
+lists all changes to the file.
 """
 
 from __future__ import annotations
@@ -26,71 +26,71 @@ from legged_mw.sim.surface_points import add_sites, surfaces
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError, unknown
 
-_FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}  # options that are bits
+_FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}  # options that are bit masks
 _ENUMS = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver, **_FLAGS}
 _INTEGRATORS = {"euler": mujoco.mjtIntegrator.mjINT_EULER, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
 
 
 @dataclass(frozen=True)
 class Solver:
-    """Step and solver: written into the model's options."""
+    """Time step and solver, written into the model's options."""
 
     timestep: float = 0.004  # [s]
-    iterations: int = 1  # Newton iterations a substep
-    ls_iterations: int = 5  # line-search iterations a Newton iteration
-    integrator: str = "euler"  # or "implicitfast": joint damping is then implicit in velocity, and stable however large
+    iterations: int = 1  # Newton iterations per substep
+    ls_iterations: int = 5  # line-search iterations per Newton iteration
+    integrator: str = "euler"  # or "implicitfast", for which joint damping is implicit and always stable
 
 
 @dataclass(frozen=True)
 class RobotModel:
-    """A compiled model and the tables of names that its user needs."""
+    """A compiled model, with names and tables for its users."""
 
-    physics: mujoco.MjModel  # what is stepped: no visual geoms
-    root: str  # name of the body that carries the free joint
+    physics: mujoco.MjModel  # simulated model, without visual geoms
+    root: str  # name of the body with the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
-    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" and ``more_sensors`` -> span of sensordata
-    spec: mujoco.MjSpec  # the same with visual geoms, without ``more_sensors``: copy it, never change it
-    names: GeomNames  # of geoms and bodies
-    contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
-    site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each of ``sites``
+    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" and ``more_sensors`` -> columns of sensordata
+    spec: mujoco.MjSpec  # the model with visual geoms and without ``more_sensors``; copy it, never change it
+    names: GeomNames  # names of geoms and bodies
+    contact_geoms: tuple[str, ...] = ()  # in the order of the columns "contact"
+    site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # site of ``sites`` -> geoms
     terrain: Terrain | None = None  # None: the plane
     overrides: list[str] = field(
         default_factory=list
-    )  # a line for each thing dropped, added or changed, or a "warning: "
+    )  # a line for each dropped, added or changed thing; warnings start with "warning: "
     imu: str = ""  # site of the accelerometer, on the root and with its axes
-    pose: tuple[float, ...] = ()  # (D,) the caller's, else the keyframe's [rad]
-    held: tuple[str, ...] = ()  # joints of the file that are welded
-    speed_limits: tuple[float, ...] = ()  # (D,) [rad/s] of the motors, not in the physics; no limit is infinite
-    tables: dict[str, list[float]] = field(default_factory=dict)  # the caller's tables -> (D,) values
-    keyframe: Keyframe | None = None  # the file's
-    file_sensors: tuple[str, ...] = ()  # the file's; kept are ``more_sensors`` and those that feel contact
+    pose: tuple[float, ...] = ()  # (D,) [rad] from the caller, else from the keyframe
+    held: tuple[str, ...] = ()  # welded joints of the file
+    speed_limits: tuple[float, ...] = ()  # (D,) [rad/s] of the motors, not simulated; infinite without a limit
+    tables: dict[str, list[float]] = field(default_factory=dict)  # name of the caller's table -> (D,) values
+    keyframe: Keyframe | None = None  # of the file
+    file_sensors: tuple[str, ...] = ()  # sensors of the file; only ``more_sensors`` and contact sensors are kept
 
     @property
     def joint_range(self) -> np.ndarray:
-        """(D, 2) [rad]; infinite where the MJCF states none."""
+        """(D, 2) [rad]; infinite without a range in the MJCF."""
         return np.where(self.physics.jnt_limited[1:, None] > 0, self.physics.jnt_range[1:], [-np.inf, np.inf])
 
     @property
     def effort_range(self) -> np.ndarray:
-        """(D, 2) [N m]; infinite where the MJCF states none."""
+        """(D, 2) [N m]; infinite without a force limit in the MJCF."""
         return np.where(
             self.physics.actuator_forcelimited[:, None] > 0, self.physics.actuator_forcerange, [-np.inf, np.inf]
         )
 
     def ground_geoms(self) -> slice:
-        """Indices of the geoms that are the ground; all are geoms of the world body."""
+        """Indices of the ground's geoms; all are geoms of the world body."""
         names = [self.physics.geom(i).name for i in range(int(self.physics.body_geomnum[0]))]
         first = names.index(GROUND)
         return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
 
     def columns(self, sensor: str) -> slice:
-        """Columns of sensordata that ``sensor`` fills."""
+        """Columns of ``sensor`` in sensordata."""
         index = self.id("sensor", sensor)
         start = int(self.physics.sensor_adr[index])
         return slice(start, start + int(self.physics.sensor_dim[index]))
 
     def id(self, kind: str, name: str) -> int:
-        """Index of the body, geom, site or sensor (``kind``) called ``name``."""
+        """Index of the ``kind`` (body, geom, site or sensor) called ``name``. Raises ModelError if there is none."""
         obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         index = mujoco.mj_name2id(self.physics, obj, name)
         if index < 0:
@@ -109,18 +109,18 @@ def build_model(
     damping: Mapping[str, float],  # as for per_joint: passive joint damping [N m s/rad]
     colliders: Sequence[str],  # geoms that touch the ground: names of geoms or bodies, or patterns with * and ?
     self_collisions: bool,
-    contact_geoms: Sequence[str],  # likewise: each senses its contacts with the ground
-    velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
-    imu_site: str | None,  # sensed: acceleration in the root's axes [m/s^2]; see sensed_site; None: nothing
-    sites: Mapping[str, Sequence[str]] = {},  # name -> geoms, likewise, for a site that the file lacks
-    pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad], before the keyframe's; None: those, or 0
-    tables: Mapping[str, Mapping[str, float]] = {},  # name -> table, as for per_joint: for ``RobotModel.tables``
-    held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
-    partial: Mapping[str, Mapping[str, float]] = {},  # tables of PARTIAL, as for some_joints: they win over the file
-    more_sensors: Collection[str] = (),  # more that is sensed: names of SENSORS, or of the file's own sensors
-    drive: Drive = "angle",  # what ``ctrl`` means; with servos.CURVE in ``tables`` motors have torque-speed curves
+    contact_geoms: Sequence[str],  # geoms with a ground contact sensor: names or patterns, as for colliders
+    velocity_sites: Sequence[str],  # sites with a sensor of linear velocity, world frame [m/s]
+    imu_site: str | None,  # site of the accelerometer, in the root's axes [m/s^2]; see sensed_site; None: no sensor
+    sites: Mapping[str, Sequence[str]] = {},  # new site -> geoms (names or patterns), if the file lacks it
+    pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad], over the keyframe's; None: these, or 0
+    tables: Mapping[str, Mapping[str, float]] = {},  # name -> table, as for per_joint, for ``RobotModel.tables``
+    held_joints: Sequence[str] = (),  # names or patterns of joints that are welded at the pose
+    partial: Mapping[str, Mapping[str, float]] = {},  # tables of PARTIAL, as for some_joints; they override the file
+    more_sensors: Collection[str] = (),  # additional sensors: names of SENSORS, or of the file's sensors
+    drive: Drive = "angle",  # meaning of ``ctrl``; servos.CURVE in ``tables`` gives motors torque-speed curves
 ) -> RobotModel:
-    """Compile the MJCF or URDF at ``file`` for stepping."""
+    """Compile the MJCF or URDF ``file`` for simulation. Raises ModelError."""
     robot = read_file(file, more_sensors)
     spec, notes, root = robot.spec, robot.notes, robot.root
     with naming(file):
@@ -163,7 +163,7 @@ def build_model(
 
 
 def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
-    """Read the robot in ``file``, and keep its ``wanted`` sensors. Raises ModelError if it is no robot."""
+    """Read the robot in ``file`` with its ``wanted`` sensors. Raises ModelError if it is not a robot."""
     robot = read_plain(file)
     if robot is None:
         from legged_mw.robot.vendor import read_robot  # this file is not plain
@@ -173,9 +173,9 @@ def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 
 
 def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujoco.MjModel:
-    """Compile the physics, without visual geoms, lights and cameras."""
+    """Compile the model without visual geoms, lights and cameras."""
     spec.compiler.discardvisual = True
-    for extra in [*spec.lights, *spec.cameras]:  # mujoco-warp would move lights in every step
+    for extra in [*spec.lights, *spec.cameras]:  # mujoco-warp moves lights in every step
         spec.delete(extra)
     if ground.terrain and ground.boxes:
         replace_level_pieces(spec, ground.terrain, notes)
@@ -192,10 +192,10 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
         "solver": mujoco.mjtSolver.mjSOL_NEWTON,
         "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
         "integrator": _INTEGRATORS[solver.integrator],
-        "impratio": 1.0,  # other values are for the elliptic cone
-        "noslip_iterations": 0,  # mujoco-warp has no such solver
+        "impratio": 1.0,  # other values are only for the elliptic cone
+        "noslip_iterations": 0,  # mujoco-warp does not have it
         "enableflags": 0,
-        # Euler damps joints explicitly; implicitfast ignores this flag
+        # explicit joint damping with Euler; implicitfast ignores this flag
         "disableflags": spec.option.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value,
     }
     for name, value in wanted.items():
@@ -206,7 +206,7 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
 
 
 def _option(name: str, value: float) -> str:
-    """A value of an option in the words of MJCF."""
+    """The value of an option as text, with the names of MJCF."""
     if name not in _ENUMS:
         return f"{value:g}"
     members = [(word, member.value) for word, member in _ENUMS[name].__members__.items() if "_" in word]
@@ -217,7 +217,7 @@ def _option(name: str, value: float) -> str:
 def _set_collisions(
     spec: mujoco.MjSpec, names: GeomNames, patterns: Sequence[str], self_collisions: bool, notes: list[str]
 ) -> None:
-    """The ground is contype 1 and colliders have conaffinity 1; with self-collisions colliders have bit 2 in both."""
+    """Set contype and conaffinity: ground contype 1, colliders conaffinity 1; self-collisions: bit 2 in both."""
     colliders = names.find(patterns, "colliders", colliding=True)
     notes += names.passed_over(patterns)
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
@@ -236,11 +236,11 @@ def _set_collisions(
 
 
 def _leave_out_neighbours(spec: mujoco.MjSpec, angles: Sequence[float], notes: list[str]) -> None:
-    """Exclude pairs of bodies that overlap with the joints at ``angles`` (D,) [rad]: they would always push each other.
+    """Exclude collisions of bodies that overlap at the joint angles ``angles`` (D,) [rad].
 
-    MuJoCo itself leaves out bodies that a joint joins.
+    MuJoCo already excludes bodies that are connected by a joint.
     """
-    for geom in [geom for geom in spec.geoms if geom.contype]:  # an exclusion needs names
+    for geom in [geom for geom in spec.geoms if geom.contype]:  # an exclusion needs names of bodies
         geom.parent.name = geom.parent.name or f"body_of_{geom.name}"
     copy = spec.copy()
     copy.delete(copy.geom(GROUND))
@@ -258,19 +258,19 @@ def _leave_out_neighbours(spec: mujoco.MjSpec, angles: Sequence[float], notes: l
         notes.append(f"self-collisions left out, as they overlap in the pose: {overlapping}")
 
 
-# ---- how it stands
+# ---- the standing robot
 
 
 class Upright(NamedTuple):
-    """S sites of a robot with an upright root, and their bodies."""
+    """S sites of a robot with an upright root."""
 
-    places: np.ndarray  # (S, 3) of the sites in the root's frame [m]
-    bodies: np.ndarray  # (S,) index of each site's body
-    up: np.ndarray  # (S, 3) the vertical in the frame of each site's body
+    places: np.ndarray  # (S, 3) positions in the root frame [m]
+    bodies: np.ndarray  # (S,) indices of the sites' bodies
+    up: np.ndarray  # (S, 3) vertical in the frame of each site's body
 
 
 def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) -> Upright:
-    """Places of ``sites`` when the root is upright and the joints are at ``joints`` (D,) [rad]."""
+    """Positions of ``sites`` with an upright root and joint angles ``joints`` (D,) [rad]."""
     model, data = robot.physics, posed(robot.physics, joints)
     where = [robot.id("site", name) for name in sites]
     bodies = model.site_bodyid[where]
@@ -278,6 +278,6 @@ def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) ->
 
 
 def standing_height(robot: RobotModel, geoms: Sequence[str], joints: Sequence[float]) -> float:
-    """Height [m] of an upright root above the lowest point of ``geoms``, with the joints at ``joints`` (D,) [rad]."""
+    """Height [m] of an upright root above the lowest point of ``geoms``, with joint angles ``joints`` (D,) [rad]."""
     points = surfaces(robot.physics, posed(robot.physics, joints), geoms)
     return -float(min(places[:, 2].min() for places in points.values()))

@@ -1,6 +1,6 @@
-"""MuJoCo's own engine, on a thread pool of the CPU, behind fixed torch tensors.
+"""MuJoCo's own engine on a thread pool of the CPU, with fixed torch tensors.
 
-The engine has float64 rows, the tensors are float32. Only ``step`` copies between them.
+The engine's rows are float64, the tensors float32. Only ``step`` copies between them.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from legged_mw.utils.errors import ModelError, unknown
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.opaque import not_traced
 
-_STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step writes the state; it reads both
+_STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step reads both and writes the state
 _READ = ("sensordata", "actuator_force", "site_xpos", "xquat")  # computed by a step
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
 class MujocoSimulation(Simulation):
-    """The seam on MuJoCo's own engine.
+    """``Simulation`` with MuJoCo's own engine.
 
-    The same calls give the same bits, on any number of threads. A world that MuJoCo cannot step gets a ``qpos`` of NaN.
+    The same calls give the same bits for any number of threads. If MuJoCo cannot step a world, its ``qpos`` is NaN.
     """
 
     engine, device = "mujoco", "cpu"
@@ -36,10 +36,10 @@ class MujocoSimulation(Simulation):
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, *, threads: int = 0, world_fields: Sequence[str] = ()
     ) -> None:
-        """Allocate ``num_envs`` worlds, stepped by ``threads`` threads; 0: one a core."""
+        """Allocate ``num_envs`` worlds. ``threads``: 0 for one per core."""
         self.num_envs = num_envs
         model = copy.copy(model)
-        # else MuJoCo resets a broken world by itself
+        # without this flag MuJoCo resets a broken world by itself
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _keep_quiet()
         self._batch = Batch(model, num_envs, threads or usable_cores())
@@ -56,7 +56,7 @@ class MujocoSimulation(Simulation):
 
     @not_traced
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
-        if before is not None:  # the state is float32 between substeps, too
+        if before is not None:  # then the state is also rounded to float32 between substeps
             for i in range(substeps):
                 before(i)
                 self.step()
@@ -67,7 +67,7 @@ class MujocoSimulation(Simulation):
         refused = None
         try:
             self._batch.step(nstep=substeps)
-        except SimulationError as error:  # the other worlds are stepped
+        except SimulationError as error:  # all other worlds are stepped
             refused, self._failed[error.ids], self._reason = error.ids, True, " ".join(str(error).split())
         for tensor, rows in self._out:
             tensor.copy_(rows)
@@ -79,7 +79,7 @@ class MujocoSimulation(Simulation):
         which = mask.numpy()
         if not which.any():
             return
-        self._batch.state[which] = self._start  # also the solver's warm start and the clock
+        self._batch.state[which] = self._start  # includes the solver's warm start and the time
         worlds = mask.nonzero()[:, 0]
         self.qpos[worlds] = self._qpos0
         for tensor in self._cleared:
@@ -110,25 +110,25 @@ class MujocoSimulation(Simulation):
         return ""
 
     def _write_fields(self) -> None:
-        """Copy the fields that were written since the last call; the others keep their float64 values."""
+        """Copy the fields that were written since the last call. The others keep their float64 values."""
         for name, tensor in self._fields.items():
             if tensor._version != self._written[name]:
                 self._field_rows[name].copy_(tensor)
                 self._written[name] = tensor._version
 
     def _full(self) -> np.ndarray:
-        """Worlds that dropped a contact or constraint since construction."""
+        """(N,) True for worlds that dropped a contact or constraint since construction."""
         return (self._batch.warning[:, _FULL, 1] > 0).any(axis=1)
 
     def _adopt(self, name: str) -> tuple[Tensor, Tensor]:
-        """A tensor for a field of MjData, and the engine's rows of it."""
+        """Make the tensor of a field of MjData; returns it and the engine's rows."""
         rows = _tensor(self._batch.bind(name))
         tensor = rows.float()
         setattr(self, name, tensor)
         return tensor, rows
 
     def _expand(self, name: str) -> Tensor:
-        """The engine's rows (N, ...) of a field of the model."""
+        """The engine's rows (N, ...) of a model field. Raises ModelError for an unknown field."""
         arrays = {field: getattr(self._batch.model, field, None) for field in sorted(MODEL_FIELDS)}
         known = [field for field, array in arrays.items() if getattr(array, "dtype", None) == np.float64]
         if name not in (*known, GRAVITY):
@@ -137,14 +137,14 @@ class MujocoSimulation(Simulation):
 
 
 def _keep_quiet() -> None:
-    """Keep MuJoCo from printing and logging to a file when a world breaks: the caller counts and resets such worlds."""
+    """Stop MuJoCo's messages and log file on broken worlds: the caller counts and resets such worlds."""
     config = mujoco.MjLogConfig.get()
     config.logto_console = config.logto_file = False
     config.set()
 
 
 def _tensor(rows: np.ndarray) -> Tensor:
-    """A tensor on the same memory."""
+    """A tensor that shares the memory of ``rows``."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # some rows are read-only, which torch warns of
+        warnings.simplefilter("ignore")  # torch warns of read-only rows
         return torch.from_numpy(rows)

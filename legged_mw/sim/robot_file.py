@@ -1,4 +1,4 @@
-"""Read a plain MJCF, such as those in ``resources/robots``; ``legged_mw.robot`` reads all other files of robots."""
+"""Read a plain MJCF, such as those in ``resources/robots``. ``legged_mw.robot`` reads all other robot files."""
 
 from __future__ import annotations
 
@@ -15,49 +15,49 @@ import numpy as np
 
 from legged_mw.utils.errors import ModelError
 
-# What a plain MJCF consists of: one body with a free joint, no other file, numbers that a machine may have.
+# A plain MJCF has one body with a free joint, no other files, and only values that are possible for a machine.
 _SECTIONS = {"compiler", "option", "default", "asset", "worldbody", "keyframe"}
 _IN_ASSET = {"material", "mesh"}
 _IN_COMPILER = {"angle", "autolimits"}
 _IN_DEFAULT = {"default", "joint"}  # other defaults would apply to elements that are added
 _IN_BODY = {"body", "freejoint", "joint", "inertial", "geom", "site"}
 _NOT_NEGATIVE = {"mass", "density", "diaginertia", "armature", "frictionloss"}
-_MOST_BYTES, _LARGEST = 1 << 20, 1e5  # of a plain file; of its numbers, in any unit, and of the mass [kg]
-# names of the ground and of a scene, which are added around a robot
+_MOST_BYTES, _LARGEST = 1 << 20, 1e5  # largest size of a plain file; largest value, in any unit, and mass [kg]
+# names of the ground and the scene, which are added to a robot
 SCENE = re.compile(r"(floor|ground|around|relief|sky)(/.*)?")
 
 Range = tuple[float, float]
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-UPRIGHT = 0.5  # [degrees] less tilt is rounding
+UPRIGHT = 0.5  # [degrees] tilt below this is a rounding error
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A pose that the file holds."""
+    """A pose in the file."""
 
     name: str
-    height: float | None  # of the upright root [m]; None: the file has no free joint, or tilts it
+    height: float | None  # of the upright root [m]; None: no free joint, or a tilted root
     angles: dict[str, float]  # joint -> [rad]
 
 
 @dataclass(frozen=True)
 class RobotFile:
-    """A robot alone: one root with a free joint, named joints, no actuators, few of its own sensors."""
+    """A robot without ground and actuators: one root with a free joint, named joints, and the sensors that are kept."""
 
     spec: mujoco.MjSpec
-    model: mujoco.MjModel  # the same, compiled
-    where: str  # the file's name
-    notes: list[str]  # a line for each thing that was dropped, added or renamed
-    limits: dict[str, Range]  # joint -> lowest and highest force [N m], where the file limits it
-    speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
+    model: mujoco.MjModel  # the compiled ``spec``
+    where: str  # name of the file
+    notes: list[str]  # a line for each dropped, added or renamed thing
+    limits: dict[str, Range]  # joint -> lowest and highest force [N m], if the file limits it
+    speeds: dict[str, float]  # joint -> highest speed [rad/s], if the file limits it
     keyframe: Keyframe | None  # "home", or the only one
-    sensors: tuple[str, ...] = ()  # names of the file's sensors, kept or dropped
-    # geom or body with a collider that is left out, as its mesh cannot be read -> an error for who needs it
+    sensors: tuple[str, ...] = ()  # names of all sensors of the file, kept or dropped
+    # geom or body with a dropped collider, whose mesh cannot be read -> error text for callers that need it
     lost: dict[str, str] = field(default_factory=dict)
 
     @property
     def root(self) -> str:
-        """Name of the body that carries the free joint."""
+        """Name of the body with the free joint."""
         return self.spec.joints[0].parent.name
 
     @property
@@ -67,7 +67,7 @@ class RobotFile:
 
 
 def read_plain(file: Path) -> RobotFile | None:
-    """Read a plain MJCF. None if ``file`` is not plain: ``legged_mw.robot.vendor`` reads it or says why not."""
+    """Read a plain MJCF. None if ``file`` is not plain: then ``legged_mw.robot.vendor`` reads it or raises."""
     try:
         if not file.is_file() or file.stat().st_size > _MOST_BYTES:
             return None
@@ -78,7 +78,7 @@ def read_plain(file: Path) -> RobotFile | None:
         limits, joints = joint_limits(spec), list(spec.joints)[1:]
         if not joints or not all(joint.type in SCALAR_JOINTS and joint.name for joint in joints):
             return None
-        for key in list(spec.keys):  # its size would not fit the motors that are added
+        for key in list(spec.keys):  # a keyframe does not fit a model with added motors
             qpos, names = list(key.qpos), [joint.name for joint in joints]
             if len(qpos) != 7 + len(names) or tilt(qpos[3:7]) > UPRIGHT:
                 return None
@@ -96,7 +96,7 @@ def read_plain(file: Path) -> RobotFile | None:
 
 
 def _is_plain(root: Element) -> bool:
-    """Decided by elements and attributes alone, before MuJoCo reads the file."""
+    """Whether the MJCF is plain, by its elements and attributes, before MuJoCo reads it."""
     bodies = root.findall("worldbody/*")
     if root.tag != "mujoco" or len(bodies) != 1 or not bodies[0].get("name"):
         return False
@@ -115,7 +115,7 @@ def _is_plain(root: Element) -> bool:
 
 
 def _is_plain_attribute(name: str, value: str) -> bool:
-    """It names no file; its numbers, if it has any, are finite and of a size that machines have."""
+    """Whether the attribute names no file and its numbers, if any, are finite and possible for a machine."""
     if name.startswith("file"):
         return False
     lowest = 0.0 if name in _NOT_NEGATIVE else -_LARGEST
@@ -132,7 +132,7 @@ def _tags(element: Element) -> set[str]:
 
 
 def joint_limits(spec: mujoco.MjSpec) -> dict[str, Range]:
-    """Joint -> lowest and highest force [N m], of joints with an actuatorfrcrange (in a URDF: effort)."""
+    """Joint -> lowest and highest force [N m], for joints with an actuatorfrcrange (URDF: effort)."""
     return {
         joint.name: tuple(joint.actfrcrange)
         for joint in spec.joints
@@ -141,12 +141,12 @@ def joint_limits(spec: mujoco.MjSpec) -> dict[str, Range]:
 
 
 def is_limited(switch: int, span: np.ndarray) -> bool:
-    """Whether a limit with this switch and range is in force."""
+    """Whether a limit with this switch and range is active."""
     return bool(switch != mujoco.mjtLimited.mjLIMITED_FALSE and span[1] > span[0])
 
 
 def compile_copy(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a copy of ``spec``. Visual geoms are slow: compile them only to find mistakes in files of theirs."""
+    """Compile a copy of ``spec``. Visual geoms are slow, so they are compiled only to find faults in their files."""
     copy = spec.copy()
     copy.compiler.discardvisual = not any(item.file for item in (*spec.meshes, *spec.textures))
     return copy.compile()
@@ -154,7 +154,7 @@ def compile_copy(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 @contextmanager
 def naming(file: Path) -> Iterator[None]:
-    """Turn MuJoCo's errors into one line with the file's name."""
+    """A context that turns MuJoCo's errors into a ModelError of one line with the file's name."""
     try:
         yield
     except ModelError:
@@ -167,7 +167,7 @@ def naming(file: Path) -> Iterator[None]:
 
 
 def kind_of(file: Path) -> str:
-    """The format that its name states."""
+    """The format of the file, by its name."""
     return "URDF" if file.suffix == ".urdf" else "MJCF"
 
 

@@ -1,4 +1,4 @@
-"""The sensors that are added to a robot, and the columns of ``sensordata`` that they fill."""
+"""The sensors that are added to a robot, and their columns in ``sensordata``."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import mujoco
 from legged_mw.sim.ground import GROUND
 from legged_mw.utils.errors import ModelError, unknown
 
-SELF_CONTACT = "self_contacts"  # how many contacts the robot has with itself
+SELF_CONTACT = "self_contacts"  # number of contacts of the robot with itself
 ANGULAR_MOMENTUM = "angular_momentum"  # of the whole robot about its centre of mass, world frame [kg m^2/s]
-CONTACT_FORCE = "contact_forces"  # of each contact geom: the net force on the ground, world frame [N]
+CONTACT_FORCE = "contact_forces"  # net force of each contact geom on the ground, world frame [N]
 _SENS, _OBJ = mujoco.mjtSensor, mujoco.mjtObj
 _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}")) for name in ("FOUND", "FORCE"))
-_NET = 3  # the contact sensor's reduction: all contacts as one, in the world's frame
+_NET = 3  # reduction of the contact sensor: net force of all contacts, world frame
 
 
 def _sense_self_contacts(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
@@ -29,12 +29,12 @@ def _sense_angular_momentum(spec: mujoco.MjSpec, root: str, contact_geoms: Seque
 
 
 def _sense_contact_forces(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    """The sensors of "contact" measure the force too, so that contacts are searched once."""
+    """Let the sensors "contact/..." also measure the force, so that contacts are searched only once."""
     for name in contact_geoms:
         spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]
 
 
-# Sensors on demand: name -> function that adds the sensor of that name, given the root and the contact geoms.
+# Sensors on demand: name -> function that adds the sensor, with arguments spec, root and contact geoms.
 SENSORS: dict[str, Callable[[mujoco.MjSpec, str, Sequence[str]], None]] = {
     SELF_CONTACT: _sense_self_contacts,
     ANGULAR_MOMENTUM: _sense_angular_momentum,
@@ -45,7 +45,7 @@ SENSORS: dict[str, Callable[[mujoco.MjSpec, str, Sequence[str]], None]] = {
 def add_sensors(
     spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str, where: str
 ) -> None:
-    """Add contact sensors of geoms, velocities of sites and the accelerometer, each group in one span of sensordata."""
+    """Add contact sensors of geoms, velocity sensors of sites and the accelerometer. Raises ModelError."""
     sites = [site.name for site in spec.sites if site.name]
     for name in (*velocity_sites, *([imu] if imu else [])):
         if name not in sites:
@@ -62,14 +62,14 @@ def add_sensors(
 
 
 def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str], more: Collection[str]) -> None:
-    """Add those of ``SENSORS`` that ``more`` names, after ``add_sensors``. Both engines compute them once a step."""
+    """Add the sensors of ``SENSORS`` in ``more``, after ``add_sensors``. Both engines compute them once per step."""
     for name, add in SENSORS.items():
         if name in more:
             add(spec, root, contact_geoms)
 
 
 def sensor_spans(model: mujoco.MjModel, more: Collection[str]) -> dict[str, slice]:
-    """Columns of sensordata, by group: those of ``add_sensors``, and those of ``SENSORS`` that ``more`` names."""
+    """Group -> columns of sensordata, for the groups of ``add_sensors`` and the sensors of ``SENSORS`` in ``more``."""
     groups = ["".join(model.sensor(i).name.partition("/")[:2]) for i in range(model.nsensor)]
     spans = {}
     for group in ("contact/", "linvel/", "accelerometer/", *(name for name in SENSORS if name in more)):
@@ -77,6 +77,6 @@ def sensor_spans(model: mujoco.MjModel, more: Collection[str]) -> dict[str, slic
         starts, sizes = model.sensor_adr[members], model.sensor_dim[members]
         spans[group.rstrip("/")] = slice(int(starts[0]), int(starts[0] + sizes.sum())) if members else slice(0, 0)
     if CONTACT_FORCE in more:
-        spans[CONTACT_FORCE] = spans["contact"]  # (contacts, 4), of which the first column is the count
+        spans[CONTACT_FORCE] = spans["contact"]  # (contacts, 4): count, force
         spans["contact"] = slice(spans["contact"].start, spans["contact"].stop, 4)
     return spans

@@ -1,4 +1,4 @@
-"""A motor a joint: the caller chooses its law and gains, the machine states force limit, armature and dry friction."""
+"""One motor per joint. The caller chooses law and gains; force limit, armature and dry friction are the machine's."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from legged_mw.sim.joints import PARTIAL, PosedRobot, some_joints
 from legged_mw.sim.robot_file import Range, RobotFile
 from legged_mw.utils.motor_network import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
 
-# what ctrl means: an angle to turn to [rad], a speed [rad/s], or a torque [N m]
+# meaning of ctrl: target angle [rad], target speed [rad/s], or torque [N m]
 Drive = Literal["angle", "speed", "torque"]
-# tables of a torque-speed curve at the motor, before its gear: [N m], [rad/s]
+# tables of a torque-speed curve of the motor, before its gear: [N m], [rad/s]
 CURVE = ("stall_torque", "no_load_speed")
-_INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
+_INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # DC motor: bits "pos", "vel" and "ff" of its input signature
 
 
 def set_machine(
     robot: RobotFile, partial: Mapping[str, Mapping[str, float]], posed: PosedRobot, drive: Drive
 ) -> tuple[float, ...]:
-    """Add motors with force limits, armature and dry friction; ``partial`` (tables of PARTIAL) wins over the file.
+    """Add motors with force limits, armature and dry friction. ``partial`` (tables of PARTIAL) overrides the file.
 
-    Torque-speed curves in ``posed.tables`` become the joints'. Returns speed limits (D,) [rad/s]; no limit is infinite.
+    Torque-speed curves in ``posed.tables`` are changed from motor to joint. Returns speed limits (D,) [rad/s]; infinite
+    without a limit.
     """
     tables, notes = posed.tables, robot.notes
     tables.update(_curves_at_joints(tables))
@@ -54,7 +55,7 @@ def set_machine(
 
 
 def _curves_at_joints(tables: Mapping[str, list[float]]) -> dict[str, list[float]]:
-    """The torque-speed curves behind the gears: a gear multiplies a motor's torque and divides its speed."""
+    """The torque-speed curves at the joints: a gear multiplies the motor's torque and divides its speed."""
     curves = {}
     for name, power in zip(CURVE, (1.0, -1.0), strict=True):
         if name in tables and "gear" in tables:
@@ -66,10 +67,10 @@ def _curves_at_joints(tables: Mapping[str, list[float]]) -> dict[str, list[float
 def _add_motor(
     robot: RobotFile, joint: mujoco.MjsJoint, span: Range, numbers: Mapping[str, float], drive: Drive
 ) -> None:
-    """Add MuJoCo's DC motor at 1 V if the joint has a curve, else its position servo or plain motor, with its limits.
+    """Add MuJoCo's DC motor at 1 V if the joint has a curve, else a position servo or plain motor, with force limits.
 
-    A target angle is held to ``span``, the joint's range [rad]. A servo's damping is the joint's, outside of the force
-    limit; a DC motor's is part of its law, inside.
+    A target angle is clipped to ``span``, the joint's range [rad]. A servo's damping is joint damping, which the force
+    limit does not limit. A DC motor's damping is part of its torque, which the force limit limits.
     """
     kp, kd, speed = numbers["stiffness"], numbers["damping"], numbers.get("no_load_speed", 0.0)
     motor = robot.spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -100,7 +101,7 @@ def _add_motor(
     robot.notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {laws[drive]}{curve}")
     if drive == "angle" and np.isfinite(span).all():
         motor.ctrllimited, motor.ctrlrange = True, span
-    if joint.name in robot.limits:  # on the motor and not on the joint, so that actuator_force is the clamped force
+    if joint.name in robot.limits:  # limit the motor, not the joint, so that actuator_force is the clamped force
         motor.forcelimited, motor.forcerange = True, list(robot.limits[joint.name])
         joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
 
@@ -108,9 +109,9 @@ def _add_motor(
 def scaled_gains(
     nominal: Mapping[str, Tensor], factors: Mapping[str, Tensor], curves: bool
 ) -> Iterator[tuple[str, int, Tensor]]:
-    """Model field, place in it and its values (N, D): ``nominal`` gains (1, D, ...) times ``factors`` (N, D).
+    """(model field, index, values (N, D)): ``nominal`` gains (1, D, ...) times ``factors`` (N, D).
 
-    With ``curves`` they are MuJoCo's DC motors: no-load speed = 1 / constant, stall torque = constant / resistance.
+    With ``curves`` motors are MuJoCo's DC motors: no-load speed = 1 / constant, stall torque = constant / resistance.
     """
     field = "actuator_gainprm"
     gains = nominal[field]

@@ -1,4 +1,4 @@
-"""mujoco-warp behind fixed torch tensors: every view is the simulator's own memory."""
+"""mujoco-warp with fixed torch tensors, which are views of the simulator's memory."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError, unknown
 from legged_mw.utils.opaque import fast, not_traced
 
-wp.config.log_level = wp.LOG_WARNING  # else it prints a line for each kernel module
+wp.config.log_level = wp.LOG_WARNING  # otherwise warp prints a line for each kernel module
 
 _STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
-# Other fields that carry over from step to step.
+# Other fields that the next step reads.
 _CARRIED = ("time", "act", "qacc_warmstart", "qfrc_applied", "eq_active")
 _CARRIED += ("mocap_pos", "mocap_quat", "history", "plastic", "userdata")
-# With 1 Newton and 5 line-search iterations both bits are always set: they say "not converged", as intended.
+# Both bits mean "not converged". With 1 Newton and 5 line-search iterations they are always set, as intended.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
-# With more Newton iterations a conditional loop in the graph pays for its launch.
+# With more Newton iterations a conditional loop in the graph saves more time than it costs.
 _UNROLLED_ITERATIONS = 10
 
 
 class WarpSimulation(Simulation):
-    """The seam on mujoco-warp."""
+    """``Simulation`` with mujoco-warp."""
 
     engine = "mujoco_warp"
     overflow: Tensor  # (N,) int32, bits of mujoco_warp.OverflowType since the world's last reset
@@ -53,8 +53,8 @@ class WarpSimulation(Simulation):
         terrain: Terrain | None = None,
         eager: bool = False,
     ) -> None:
-        """Allocate. Physics repeats bit for bit on a CPU but not on a GPU: mujoco-warp 4.0.0 orders constraint rows by
-        an atomic counter, even in its deterministic mode, so sums differ in the last bit.
+        """Allocate ``num_envs`` worlds. Physics is bit-exact on a CPU but not on a GPU: mujoco-warp 4.0.0 orders
+        constraint rows by an atomic counter, even in its deterministic mode, so sums differ in the last bit.
         """
         self.num_envs, self.device = num_envs, device
         self.nconmax, self.njmax = nconmax, njmax
@@ -62,14 +62,14 @@ class WarpSimulation(Simulation):
         self._eager = eager or not self._device.is_cpu
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
-            # else every world silently uses the first world's values
+            # without a value per world all worlds use the constants of the first world, without an error
             derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()
             batched = [name for name in (*world_fields, *derived) if name != GRAVITY]
             self._model = make_model(model, terrain, dict.fromkeys(batched, num_envs))
             option = self._model.opt
             if GRAVITY in world_fields:
                 option.gravity = wp.array(np.tile(model.opt.gravity, (num_envs, 1)), dtype=wp.vec3)
-            option.warn_overflow = 0  # we read the bits; printing from a kernel costs time
+            option.warn_overflow = 0  # ``overflow_report`` reads the bits; printing in a kernel is slow
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
             shortcuts = fast("skip_kernels")
@@ -97,7 +97,7 @@ class WarpSimulation(Simulation):
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
-        # reset_data leaves the old values, even NaN
+        # reset_data keeps the old values of these, even NaN
         for stale in (self.actuator_force, self.site_xpos, self.xquat):
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
 
@@ -125,7 +125,7 @@ class WarpSimulation(Simulation):
             raise_.append(f"njmax (now {self.njmax})")
         if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
             raise_.append(f"nconmax (now {self.nconmax})")
-        if OverflowType.CONTACT_MATCH in bits:  # more contacts than one sensor stores
+        if OverflowType.CONTACT_MATCH in bits:  # more contacts than a sensor stores
             most = self._model.opt.contact_sensor_maxmatch
             raise_.append(f'<numeric name="contact_sensor_maxmatch" data="{2 * most}"/> in the MJCF (now {most})')
         advice = f"raise {' and '.join(raise_)}" if raise_ else "simpler geoms or fewer contacts may help"
@@ -136,7 +136,7 @@ class WarpSimulation(Simulation):
         return wp.to_torch(self._data.actuator_velocity)
 
     def _substeps(self, which: Sequence[int], count: int) -> None:
-        """Run substeps of a step of ``count``. Only the last computes sensors, which feed nothing back."""
+        """Run the substeps ``which`` of a step with ``count`` substeps. Only the last one computes sensors."""
         option = self._model.opt
         flags = option.disableflags
         for i in which:
@@ -168,7 +168,7 @@ def _check_fields(names: Sequence[str]) -> None:
 def make_model(
     model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None
 ) -> mjw.Model:
-    """The model on the current device; with a ``terrain``, our own contacts replace those of its height field."""
+    """The model on the current device. With a ``terrain`` our own contacts replace those of its height field."""
     if terrain is None:
         return mjw.put_model(model, batch_sizes=batch_sizes)
     touch, model = touch_ground(model, model.geom(GROUND).id, terrain), copy.copy(model)
@@ -179,7 +179,7 @@ def make_model(
 
 
 def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]:
-    """Record ``fn``, which only launches warp kernels. On a CPU a replay costs a tenth of the launches."""
+    """Record ``fn``, which only launches warp kernels. On a CPU a replay takes a tenth of the time of the launches."""
     with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
         fn()
     graph = capture.graph

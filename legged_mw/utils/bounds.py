@@ -4,7 +4,7 @@
     interval: PositiveRange = [1.0, 3.0]
     stiffness: dict[str, NonNegative] = {}
 
-Every number is finite. Errors and the reference of fields show the same text: `bounds_text`.
+All numbers must be finite. Errors and the reference of fields show the same text, `bounds_text`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from legged_mw.utils.errors import CONTROL
 
 
 class Bound(NamedTuple):
-    """The values that a field takes."""
+    """A condition on the value of a field."""
 
     text: str  # completes "it must be ..."
     holds: Callable[[Any], bool]
@@ -39,7 +39,7 @@ def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
 
 
 _ALWAYS = {
-    float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # enough in every unit here
+    float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # enough for all units in a config
     int: Bound("below 10^24", lambda value: abs(value) < 10**24),
     str: Bound("text without control characters", lambda value: not CONTROL.search(value)),
 }
@@ -58,17 +58,17 @@ NonNegative = Annotated[float, at_least(0)]
 Scale = Annotated[float, Bound("another number than 0, and 10,000 at most", lambda value: 0 < abs(value) <= 1e4)]
 Share = Annotated[float, at_least(0, 1)]
 PositiveShare = Annotated[float, above(0, 1)]
-Seconds = Annotated[float, above(0, 1e6, "s")]  # a million, so that counters of steps never overflow
-Duration = Annotated[float, at_least(0, 1e6, "s")]  # the same, or 0
-Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s] more than any machine's
-Height = Annotated[float, at_least(0, 10, "m")]  # of a robot or of its feet
+Seconds = Annotated[float, above(0, 1e6, "s")]  # at most 1e6, so that counters of steps never overflow
+Duration = Annotated[float, at_least(0, 1e6, "s")]  # as Seconds, or 0
+Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s] more than any machine has
+Height = Annotated[float, at_least(0, 10, "m")]  # of a robot or its feet
 Angle = Annotated[float, Bound("from -2 pi to 2 pi rad, no degrees", lambda value: abs(value) <= 2 * math.pi)]
-Gain = Annotated[float, at_least(0, 1e6)]  # of a joint or motor, in SI units: more than any robot's
+Gain = Annotated[float, at_least(0, 1e6)]  # of a joint or motor, in SI units; more than any robot has
 Sign = Annotated[float, Bound("1 or -1", lambda value: value in (1, -1))]
 
 Count = Annotated[int, at_least(1)]
 NonNegativeInt = Annotated[int, at_least(0)]
-SmallInt = Annotated[int, at_least(1, 1000)]  # repetitions in a loop, which would never end with more
+SmallInt = Annotated[int, at_least(1, 1000)]  # repetitions of a slow loop
 Threads = Annotated[int, at_least(0, 1024)]
 
 Names = Annotated[list[str], SOME]
@@ -77,7 +77,7 @@ PositiveRange = Annotated[list[Positive], PAIR]
 
 
 def bare(kind: Any) -> Any:
-    """A type without its bounds."""
+    """The type without its bounds."""
     origin, args = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return bare(args[0])
@@ -89,14 +89,14 @@ def bare(kind: Any) -> Any:
 
 
 def bounds_of(kind: Any) -> list[Bound]:
-    """The bounds of the type itself, not of its elements. A bare type has those of all its values."""
+    """The bounds of the type, not of its elements. A type without own bounds has those of ``_ALWAYS``."""
     if get_origin(kind) is Annotated:
         return [bound for bound in get_args(kind)[1:] if isinstance(bound, Bound)]
     return [_ALWAYS[kind]] if kind in _ALWAYS else []
 
 
 def bounds_text(kind: Any) -> str:
-    """The bounds of a type, in words that complete "it must be ..."; "" if it has none."""
+    """The bounds of a type as text that completes "it must be ..."; "" if it has none."""
     origin, args = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return "; ".join(filter(None, [*(bound.text for bound in bounds_of(kind)), bounds_text(args[0])]))

@@ -1,6 +1,6 @@
-"""The table of commands, for training, contract, viewer and deploy: names, ranges, units, defaults.
+"""The table of commands for training, contract, viewer and deploy: names, ranges, units, defaults.
 
-Needs neither torch nor a simulator.
+It imports neither torch nor a simulator.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-HEADING = "heading"  # a range, but no command: commands.heading_command computes the yaw rate from it
+HEADING = "heading"  # a range but not a command: commands.heading_command computes the yaw rate from it
 
 
 class Command(NamedTuple):
@@ -21,12 +21,12 @@ class Command(NamedTuple):
     low: float  # [unit]
     high: float  # [unit]
     unit: str = ""
-    mirror: float | None = None  # its sign in the left-right mirror image: 1 or -1; None: not stated
-    default: float = 0.0  # [unit] when no command is given; within low and high
+    mirror: float | None = None  # sign in the left-right mirror image: 1 or -1; None: unknown
+    default: float = 0.0  # [unit] value without a user's command, from low to high
 
     @property
     def label(self) -> str:
-        """Short name for people."""
+        """Short name for display."""
         return LABELS.get(self.name, self.name.replace("_", " "))
 
 
@@ -38,7 +38,8 @@ _KNOWN = {"lin_vel_x": ("m/s", 1.0), "lin_vel_y": ("m/s", -1.0), "ang_vel_yaw": 
 def command_table(cfg: Any) -> tuple[Command, ...]:
     """The commands of an environment's config, in the order of ``commands.ranges``; () without that section.
 
-    Raises ConfigError for a unit, a mirror sign or a default of a command that ``commands.ranges`` does not have.
+    Raises ConfigError for a unit, a mirror sign or a default of a command that is not in ``commands.ranges``, and for
+    a default outside of its range.
     """
     section = getattr(cfg, "commands", None)
     if section is None:
@@ -59,5 +60,5 @@ def command_table(cfg: Any) -> tuple[Command, ...]:
 
 
 def with_units(table: Sequence[Command]) -> str:
-    """``vx, vy [m/s], yaw rate [rad/s]``: labels with units."""
+    """Labels with units, as ``vx [m/s], vy [m/s], yaw rate [rad/s]``."""
     return ", ".join(f"{c.label} [{c.unit}]" if c.unit else c.label for c in table)

@@ -1,7 +1,7 @@
 """Class-based configuration: a field is declared once, with a type, and every later value of it is checked.
 
-Here live the rule (annotated = declares, bare = overrides) and the types of fields; utils/bounds.py has their bounds.
-Fields of robots, simulators and trainers live elsewhere, and so does the meaning of their numbers.
+This module has the rule (annotated = declares, bare = overrides) and the types of fields; utils/bounds.py has their
+bounds. It has no fields of robots, simulators or learners.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from legged_mw.utils.yaml_file import load_yaml, parse_yaml, save_yaml
 __all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_yaml", "save_yaml", "type_text"]
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
-_PLAIN = None | bool | int | float | str | list | dict  # what `Any` means in a config: all that YAML can hold
+_PLAIN = None | bool | int | float | str | list | dict  # values of a field of type `Any`: all types of YAML
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
 
 class OutOfBounds(ConfigError):
-    """A value of the right type, outside of its field's bounds."""
+    """A value of the right type that is outside of the bounds of its field."""
 
 
 def _schema(cls: type) -> dict[str, Any]:
-    """Name -> type of each field or class of each section, the parents' first. Checks `cls` the first time."""
+    """Name -> type of a field or class of a section, those of the parents first. The first call checks `cls`."""
     if cls in _SCHEMAS:
         return _SCHEMAS[cls]
     known: dict[str, Any] = {}
@@ -52,8 +52,8 @@ def _schema(cls: type) -> dict[str, Any]:
             fields[name] = kind
         if _is_section(kind):
             _schema(kind)
-            fields[name].__setattr__ = _guarded_setattr  # the only thing ever added to a section's class
-    if vars(cls).get("_only"):  # inherited fields that it does not write itself are 0
+            fields[name].__setattr__ = _guarded_setattr  # the only attribute that is added to a section's class
+    if vars(cls).get("_only"):  # inherited fields that `cls` does not set are 0
         if not getattr(cls, "_open", False):
             wrong = f"{_path(cls)} is not an open table of numbers: leave `_only` out of it"
             raise ConfigError(f"{_place(cls, '_only')}: {wrong}")
@@ -63,7 +63,7 @@ def _schema(cls: type) -> dict[str, Any]:
 
 
 def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
-    """The type or section of `name` in `cls`, given the fields `known` to its parents; None for a method."""
+    """The type or section of `name` in `cls`; None for a method. `known`: the fields of the parents."""
     path, inherited, value = f"{_path(cls)}.{name}", known.get(name), getattr(cls, name, None)
     parent, annotated = cls.__bases__[0], name in inspect.get_annotations(cls)
     if _is_section(value) and not annotated:
@@ -90,7 +90,7 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
 
 
 def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
-    """The section `name` of `cls`. It must extend the sections of this name in all parents of `cls`."""
+    """The section `name` of `cls`. Raises ConfigError unless it extends those of all parents of `cls`."""
     path = f"{_path(cls)}.{name}"
     if inherited is not None and not _is_section(inherited):
         raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
@@ -107,7 +107,7 @@ def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
 
 
 def _joined(cls: type, name: str, sections: list[type]) -> type:
-    """The section of a class that writes none: the fields of all its parents' `sections`. The first parent wins."""
+    """The section of a class that does not write it: the fields of all parents' `sections`. The first parent wins."""
     last = [
         section
         for section in dict.fromkeys(sections)
@@ -123,7 +123,9 @@ def _joined(cls: type, name: str, sections: list[type]) -> type:
 
 
 def _declared_type(cls: type, name: str, inherited: Any) -> Any:
-    """The annotation of `name` in `cls`. It must be supported, come with a value, and agree with the parents'."""
+    """The annotation of `name` in `cls`. Raises ConfigError if it is not supported, has no value, or differs from the
+    parents'.
+    """
     path, written = f"{_path(cls)}.{name}", inspect.get_annotations(cls)[name]
     names = vars(sys.modules[cls.__module__]) if cls.__module__ in sys.modules else {}
     try:
@@ -165,7 +167,7 @@ def _is_section(kind: Any) -> TypeGuard[type]:
 
 
 def _path(cls: type) -> str:
-    """`Go1.rewards.scales`: Python's qualified name of a nested class is the dotted path of the section."""
+    """The dotted path of a section, as `Go1.rewards.scales`: Python's qualified name of the nested class."""
     return cls.__qualname__.rpartition("<locals>.")[2]
 
 
@@ -174,7 +176,7 @@ def _parents(cls: type, name: str) -> str:
 
 
 def type_text(kind: Any) -> str:
-    """A type as Python writes it, without its bounds."""
+    """The type in Python's notation, without its bounds."""
     kind = bare(kind)
     if get_origin(kind) is Union:  # a union with a Literal
         return " | ".join("None" if arm is NoneType else type_text(arm) for arm in get_args(kind))
@@ -182,7 +184,7 @@ def type_text(kind: Any) -> str:
 
 
 def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
-    """`; did you mean ...?` with the nearest name, else with the same name in a section further down; else ''."""
+    """`; did you mean ...?` with the nearest name, else with the same name in a nested section; else ''."""
     near = difflib.get_close_matches(name, fields, n=1)
     if not near and isinstance(fields, Mapping):
         near = [path for path, _ in _walk(fields) if path.rpartition(".")[2] == name]
@@ -200,10 +202,10 @@ def _walk(fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _place(cls: type, name: str) -> str:
-    """`file:line` where `cls` writes `name`. Reads the source, which is slow: for errors only."""
+    """`file:line` where `cls` sets `name`. It reads the source, which is slow, so only errors use it."""
     try:
         lines, first = inspect.getsourcelines(cls)
-    except (OSError, TypeError):  # written at a prompt, or by code
+    except (OSError, TypeError):  # no source file: made at a prompt or by code
         return f"module {cls.__module__}"
     written = [i for i, line in enumerate(lines) if re.match(rf"\s+(class\s+)?{name}\s*[:=(]", line)]
     outermost = min(written, key=lambda i: len(lines[i]) - len(lines[i].lstrip()), default=0)
@@ -211,7 +213,7 @@ def _place(cls: type, name: str) -> str:
 
 
 def fit(value: Any, kind: Any, path: str) -> Any:
-    """`value` as a `kind`: an int becomes a float if need be, containers are copied. Errors begin with `path`."""
+    """`value` as the type `kind`: an int may become a float, containers are copied. Raises ConfigError with `path`."""
     origin: Any = get_origin(kind) or kind
     args = get_args(kind)
     if _is_section(kind):
@@ -221,7 +223,7 @@ def fit(value: Any, kind: Any, path: str) -> Any:
             fitted = fit(value, args[0], path)
         except OutOfBounds:
             if args[0] in (int, float):
-                _within(value, kind, path)  # the field's own bounds say more than those of every number
+                _within(value, kind, path)  # the bounds of the field are more specific than those of all numbers
             raise
         return _within(fitted, kind, path)
     if kind is Any or origin in (Union, UnionType):
@@ -245,7 +247,7 @@ def fit(value: Any, kind: Any, path: str) -> Any:
 
 
 def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
-    """`value` as one of the types of a union. Its own type is tried first: 3 stays an int in `float | int`."""
+    """`value` as one of the types of a union. The type of `value` is tried first: 3 stays an int in `float | int`."""
     outside: list[OutOfBounds] = []
     for arm in sorted(get_args(kind), key=lambda arm: (get_origin(bare(arm)) or bare(arm)) is not type(value)):
         try:
@@ -267,11 +269,11 @@ def _within(value: Any, kind: Any, path: str) -> Any:
 
 
 def _parse(text: str, kind: Any, path: str) -> Any:
-    """`text` as a `kind`: verbatim for a str, else read as YAML, else verbatim (`run_7` for a `str | int`)."""
+    """`text` converted to `kind`: unchanged for a str, else as YAML, else unchanged (`run_7` for a `str | int`)."""
     try:
         value = text if bare(kind) is str else parse_yaml(text, path)
         if isinstance(value, dict) and any(":" in str(key) and item is None for key, item in value.items()):
-            value = parse_yaml(re.sub(r":(?=\S)", ": ", text), path)  # {a:1}, which to YAML is a key without a value
+            value = parse_yaml(re.sub(r":(?=\S)", ": ", text), path)  # {a:1} is a key without a value in YAML
     except ConfigError:
         value = text
     try:
@@ -284,7 +286,7 @@ def _parse(text: str, kind: Any, path: str) -> Any:
 
 
 def _kind(cls: type, name: str, path: str) -> Any:
-    """The type or section of `name` in `cls`, the section at `path`. Raises ConfigError if there is none."""
+    """The type or section of `name` in `cls`. Raises ConfigError if there is none. `path`: of `name`, for the error."""
     fields = _schema(cls)
     if name in fields:
         return fields[name]
@@ -303,7 +305,7 @@ def _guarded_setattr(self: Any, name: str, value: Any) -> None:
 
 
 def _fill(node: Any) -> Any:
-    """Give `node` its own copy of every default, in the order of declaration."""
+    """Copy every default into `node`, in the order of declaration."""
     cls = type(node)
     for name, kind in _schema(cls).items():
         if _is_section(kind):
@@ -330,7 +332,7 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, Any]]:
-    """(section, name, checked value) of every field in the nested `values`."""
+    """(section, name, checked value) of every field in the nested `values`. Raises ConfigError."""
     if not isinstance(values, Mapping):
         where = path or _path(type(node))
         raise ConfigError(f"{where} is a section and needs a mapping of its fields, not {brief(values)}")
@@ -344,12 +346,12 @@ def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, A
 
 
 class Config:
-    """Base of every configuration: nested plain classes are its sections, their attributes its fields.
+    """Base class of all configurations. Nested plain classes are its sections, their attributes its fields.
 
     `name: type = value` declares a field. In a subclass `name = value` overrides it, and `class env(Parent.env):` a
-    section. A class with several parents joins their sections; if two parents set a field, the first one wins.
-    A section with `_open = True` also takes new fields by a bare `name = number`. In its subclass `_only = True` sets
-    every other field to 0. All is checked when the class statement runs, and when a field is set. An instance owns a
+    section. A class with several parents has the fields of all their sections; the first parent that sets a field wins.
+    In a section with `_open = True`, a bare `name = number` also declares a new field. In its subclass `_only = True`
+    sets all other fields to 0. The checks run in the class statement and when a field is set. Each instance has its own
     copy of every default.
     """
 
@@ -360,15 +362,15 @@ class Config:
     def __init__(self) -> None:
         _fill(self)
 
-    if not TYPE_CHECKING:  # else type checkers would allow any name to be set
+    if not TYPE_CHECKING:  # with __setattr__ type checkers would allow any name
         __setattr__ = _guarded_setattr
 
     def to_dict(self) -> dict[str, Any]:
-        """Nested dicts, lists, numbers, strings and None, in the order of declaration, as YAML can hold them."""
+        """The fields as nested dicts with values that YAML can hold, in the order of declaration."""
         return _plain(self)
 
     def set(self, path: str, value: Any, where: str = "--set") -> None:
-        """Override the field at a dotted `path`. Text is read by the field's type. Errors begin with `where`."""
+        """Override the field at a dotted `path`. Text is parsed by the field's type. Raises ConfigError."""
         owner, node, kind, here = self, self, type(self), ""
         try:
             for name in path.split("."):
@@ -384,7 +386,10 @@ class Config:
             raise ConfigError(f"{where}: {error}") from None
 
     def update(self, values: Mapping[str, Any], where: str = "update") -> None:
-        """Override all fields in the nested `values`, or none if one is wrong. A dict field is replaced whole."""
+        """Override all fields in the nested `values`. If one is wrong, change nothing and raise ConfigError.
+
+        A field of type dict is replaced, not merged. `where`: start of the error.
+        """
         try:
             edits = list(_edits(self, values))
         except ConfigError as error:
@@ -393,7 +398,7 @@ class Config:
             vars(node)[name] = value
 
     def diff(self, other: Config) -> list[tuple[str, Any, Any]]:
-        """(dotted path, own value, value in `other`) of all fields that differ; None: this side lacks it."""
+        """(dotted path, own value, value in `other`) of all fields that differ; None if a side does not have it."""
         mine, theirs = dict(_leaves(self)), dict(_leaves(other))
         both = mine.keys() & theirs.keys()
         return [

@@ -1,4 +1,4 @@
-"""Errors that the user can mend: one base class, which programs print as one line; and how such lines are written."""
+"""Errors that the user can correct, which programs print as one line, and helpers for their text."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from typing import Any
 from legged_mw.utils.renamed import LEGGED_GYM_TENSORS, MOVED
 
 _LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
-# Characters that a terminal obeys, and the surrogates, which no file can hold.
+# Control characters of a terminal, and surrogates, which no file can hold.
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _STANDARD = sysconfig.get_paths()["stdlib"]
 
 
 class UserError(Exception):
-    """A wrong request, or something that the machine lacks. The text says what exists and what to do."""
+    """A wrong request, or something missing on the machine. The text says what exists and what to do."""
 
 
 class ConfigError(UserError, TypeError):
@@ -33,11 +33,11 @@ class ConfigError(UserError, TypeError):
 class ModelError(UserError, ValueError):
     """A name or number that does not fit the robot's file. The text lists what exists."""
 
-    wrong: tuple[tuple[str, str], ...] = ()  # (parameter of the called function, its fault)
+    wrong: tuple[tuple[str, str], ...] = ()  # (parameter of the called function, fault)
 
     @classmethod
     def of(cls, *wrong: tuple[str, str]) -> ModelError:
-        """The error about (parameter, fault) pairs: ``parameter: fault; parameter: fault``."""
+        """An error with the text ``parameter: fault; parameter: fault``, from (parameter, fault) pairs."""
         error = cls("; ".join(f"{parameter}: {what}" for parameter, what in wrong))
         error.wrong = wrong
         return error
@@ -50,11 +50,11 @@ class ModelError(UserError, ValueError):
 
 
 class EngineError(UserError, ValueError):
-    """An engine that does not exist, or does not run on this device."""
+    """An engine that does not exist or does not run on this device."""
 
 
 class StepError(UserError):
-    """A mistake in the user's code of a task: ``what`` is wrong, with what to write instead, and ``where`` it is."""
+    """A mistake in the user's code of a task. ``what``: the fault and the remedy; ``where``: file and line."""
 
     def __init__(self, what: str, where: str = "") -> None:
         self.what, self.where = what, where
@@ -66,33 +66,33 @@ class NotRecordable(StepError):
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an error of torch, CUDA or warp says that memory ran out."""
+    """Whether an error of torch, CUDA or warp is due to too little memory."""
     text = r"out of memory|failed to allocate|alloc_failed|can't allocate memory"
     return isinstance(error, MemoryError) or bool(re.search(text, str(error), re.IGNORECASE))
 
 
 def line_of(code: CodeType, line: int) -> str:
-    """``file:line, Class.method``, the file as the user would type it."""
+    """``file:line, Class.method``, with the file as in ``shown``."""
     return f"{shown(Path(code.co_filename))}:{line}, {code.co_qualname.rpartition('<locals>.')[2]}"
 
 
 def place_of(method: Any) -> str:
-    """Where a method is written."""
-    method = getattr(method, "func", method)  # of a partial
+    """File, line and name of a method, as in ``line_of``."""
+    method = getattr(method, "func", method)  # if it is a partial
     function = inspect.unwrap(getattr(method, "__func__", method))
     return line_of(function.__code__, function.__code__.co_firstlineno)
 
 
 @cache
 def is_library(module: str, file: str) -> bool:
-    """Whether code belongs to a library, or to the guard that watches the user's code and ours."""
+    """Whether code belongs to a library or to legged_mw.check, and not to the user's or our own code."""
     parts = module.split(".")
     known = any(".".join(parts[:n]) in _LIBRARIES for n in range(1, len(parts) + 1))
     return known or file.startswith("<") or (file.startswith(_STANDARD) and "-packages" not in file)
 
 
 def line_to_blame(error: BaseException) -> tuple[str, bool]:
-    """The innermost line of the user's code that led to ``error``, and True; else of our code, and False; else "".
+    """(innermost line of the user's code that led to ``error``, True); without one (line of our code or "", False).
 
     Only lines below the function that caught the error count.
     """
@@ -105,7 +105,7 @@ def line_to_blame(error: BaseException) -> tuple[str, bool]:
 
 
 def users_fault(error: BaseException) -> str:
-    """The lines of the user's code, called by legged_mw, that led to ``error``, the innermost first; or ""."""
+    """The lines of the user's code, called by legged_mw, that led to ``error``, innermost first; or ""."""
     lines, called = list[str](), False
     for frame, line in traceback.walk_tb(error.__traceback__):
         module, file = frame.f_globals.get("__name__", ""), frame.f_code.co_filename
@@ -117,13 +117,13 @@ def users_fault(error: BaseException) -> str:
 
 
 def in_short(error: BaseException) -> str:
-    """An error in one line, cut to 400 characters: its type, its text, and for a wrong name the right one."""
+    """An error in one line: its type, its text, cut to 400 characters, and for a wrong name the right name."""
     text = " ".join(f"{error}".split())
     return f"{type(error).__name__}: {text[:400]}{_instead(error)}" if text else type(error).__name__
 
 
 def _instead(error: BaseException) -> str:
-    """For a moved import its new place, for an attribute of legged_gym its name here, else the nearest name; or ''."""
+    """For a moved import the new module, for an attribute of legged_gym the name here, else the nearest name; or ''."""
     if isinstance(error, ImportError):
         return next((f"; it is in {place} now" for name, place in MOVED.items() if f"'{name}'" in str(error)), "")
     if not isinstance(error, AttributeError) or not error.name or error.obj is None:
@@ -135,16 +135,16 @@ def _instead(error: BaseException) -> str:
 
 
 def brief(value: object, most: int = 200) -> str:
-    """``value`` for a message, cut to ``most`` characters."""
+    """``value`` as text for a message, cut to ``most`` characters."""
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # Python writes no whole number of more than 4300 digits
+    except (ValueError, RecursionError):  # Python does not print integers with more than 4300 digits
         return f"an {type(value).__name__} too large to show"
     return text if len(text) <= most else f"{text[:most]}..."
 
 
 def printable(text: str) -> str:
-    """``text`` with control characters written as \\x1b: names from files and the net must not steer a terminal."""
+    """``text`` with control characters as \\x1b, because names from files and the network must not control a terminal."""
     return "".join(
         each if each.isprintable() or each == "\n" or unicodedata.category(each) == "Zs" else ascii(each)[1:-1]
         for each in text
@@ -152,15 +152,15 @@ def printable(text: str) -> str:
 
 
 def shown(path: Path) -> str:
-    """A path for a message, as the user would type it."""
+    """A path as text for a message, relative to the current folder if it is inside."""
     try:
         return printable(str(path.resolve().relative_to(Path.cwd())))
-    except (ValueError, OSError, RuntimeError):  # elsewhere, or a link to itself
+    except (ValueError, OSError, RuntimeError):  # outside of the current folder, or a link to itself
         return printable(str(path))
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:
-    """One line: ``name`` does not exist; the nearest name that does; all names that do."""
+    """Text that ``name`` does not exist, with the nearest name and all names."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean '{close[0]}'? " if close else ""

@@ -1,6 +1,6 @@
-"""The cores and the memory that this process may use, and the library with which MuJoCo draws.
+"""The cores and the memory that this process may use, and the OpenGL library of MuJoCo.
 
-MuJoCo reads MUJOCO_GL when it is imported. So the library is chosen before that.
+MuJoCo reads MUJOCO_GL when it is imported, so the library is chosen before the import.
 """
 
 from __future__ import annotations
@@ -15,35 +15,35 @@ from pathlib import Path
 
 from legged_mw.utils.errors import UserError
 
-# name -> library, Debian's package
+# name -> library, Debian package
 _WITHOUT_SCREEN = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "libosmesa6")}
 _ON_SCREEN = ("", "enable", "enabled", "on", "true", "1", "glfw", "glx", "cgl", "wgl")
 _OFF = ("disable", "disabled", "off", "false", "0")
 
 
 def usable_cores() -> int:
-    """CPU cores of this process: those that it may run on, divided by the processes that torchrun started here."""
+    """Number of cores that this process may use, divided by the number of torchrun's processes on this machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def settle() -> None:
-    """Turn garbage collection on after the start. The objects made so far stay, and are never searched again."""
+    """Turn on garbage collection after the start. It ignores all objects that exist now, which saves time."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()
 
 
 def free_memory(device: str = "cpu") -> float:
-    """Free bytes of ``device``; infinite if the system does not say."""
+    """Free memory of ``device`` [byte]; infinite if unknown."""
     if device != "cpu":
-        import torch  # not at the top: legged_mw.deploy runs without it
+        import torch  # here, because legged_mw.deploy runs without it
 
         return float(torch.cuda.mem_get_info(device)[0])
     lines = _read("/proc/meminfo").splitlines()
     free = [1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # of the container
-    # the cache of files in the container's use: the system frees it on demand
+    # file cache of the container, which the system frees on demand
     cached = re.search(r"^inactive_file (\d+)$", _read("/sys/fs/cgroup/memory.stat"), re.MULTILINE)
     if limit.isdigit() and used.isdigit():
         free.append(float(limit) - float(used) + float(cached[1] if cached else 0))
@@ -51,7 +51,7 @@ def free_memory(device: str = "cpu") -> float:
 
 
 def require_memory(need: float, device: str, what: str, instead: str) -> None:
-    """Raise UserError if ``device`` has less than the ``need`` bytes that ``what`` takes; ``instead`` is the advice."""
+    """Raise UserError if ``what`` needs more than the free memory. ``need`` [byte]; ``instead``: the advice."""
     free = free_memory(device)
     if need > free:
         where = "this machine" if device == "cpu" else device
@@ -60,7 +60,7 @@ def require_memory(need: float, device: str, what: str, instead: str) -> None:
 
 
 def in_bytes(count: float) -> str:
-    """A number of bytes in words: 19.6 GB."""
+    """A number of bytes as text, such as 19.6 GB."""
     power = min(int(math.log10(max(count, 1.0))) // 3, 8)
     return f"{count / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB', 'TB', 'PB', 'EB', 'ZB', 'YB')[power]}"
 
@@ -73,7 +73,7 @@ def _read(path: str) -> str:
 
 
 def has_display() -> bool:
-    """Whether a window can open here. Linux needs an X or Wayland display; other systems have one."""
+    """Whether a window can open. Linux needs an X or Wayland display; other systems always have one."""
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
@@ -92,9 +92,9 @@ def gl_fault(name: str) -> str:
 
 
 def choose_renderer() -> str:
-    """Set MUJOCO_GL so that MuJoCo can draw without a screen. Returns a warning if the user's own value does not work.
+    """Set MUJOCO_GL so that MuJoCo can draw without a screen. Returns a warning if the user's value does not work.
 
-    With a wrong value the import of MuJoCo fails, in a training too.
+    With a wrong value the import of MuJoCo fails, also in a training.
     """
     if sys.platform != "linux":
         return ""

@@ -1,7 +1,7 @@
-"""A motor's heat, torque-speed limit and power, from its torques and speeds and from what is known of it.
+"""Heat, torque-speed limit and power of motors, from their torques, speeds and ratings.
 
-Shapes: T physics steps, N robots, D motors. A motor is what turns a joint: its torque and speed are the joint's. A
-rating that nobody published is NaN, and what needs it is NaN too.
+Shapes: T physics steps, N robots, D motors. Torque and speed of a motor are those of its joint. An unknown rating is
+NaN, and so is every result that needs it.
 """
 
 from __future__ import annotations
@@ -13,41 +13,41 @@ from numpy.typing import NDArray
 
 Floats = NDArray[Any]
 
-HOT = 85.0  # [deg C] of a winding [as the limit in deploy/safety.py: drives switch themselves off at 90]
-AT_LIMIT = 0.98  # share of the torque-speed limit: a larger torque counts as at the limit [as in eval/skills.py]
+HOT = 85.0  # [deg C] limit of a winding [as in deploy/safety.py: drives switch off at 90]
+AT_LIMIT = 0.98  # share of the torque-speed limit from which a torque counts as at the limit [as in eval/skills.py]
 
 
 class Ratings(NamedTuple):
-    """What the motors and the battery bear: (D,) each at the joint, NaN where unknown."""
+    """Ratings of the motors, (D,) each at the joint, and of the battery; NaN if unknown."""
 
-    continuous_torque: Floats  # [N m] RMS, for ever
+    continuous_torque: Floats  # [N m] RMS, without a time limit
     motor_constant: Floats  # [N m/W^0.5] torque per root of the heat in the winding: Kt * gear / sqrt(resistance)
-    thermal_resistance: Floats  # [K/W] from the winding to the room
+    thermal_resistance: Floats  # [K/W] from the winding to the ambient air
     thermal_time: Floats  # [s] time constant of the winding
     peak_torque: Floats  # [N m] up to knee_speed; unknown: the simulation's limit
-    knee_speed: Floats  # [rad/s] from here on the torque falls; unknown: only at top_speed
-    top_speed: Floats  # [rad/s] without load
-    battery_power: float  # [W] the most that the battery gives
+    knee_speed: Floats  # [rad/s] speed above which the largest torque decreases; unknown: top_speed
+    top_speed: Floats  # [rad/s] no-load speed
+    battery_power: float  # [W] largest power of the battery
 
 
 BATTERY = "battery_power"
-TABLES = tuple(name for name in Ratings._fields if name != BATTERY)  # those with a value a motor
+TABLES = tuple(name for name in Ratings._fields if name != BATTERY)  # ratings with a value per motor
 
 
 def rms(torque: Floats) -> Floats:
-    """(D,) [N m] root of the mean square of ``torque`` (T, N, D)."""
+    """(D,) [N m] root mean square of ``torque`` (T, N, D)."""
     return np.sqrt((torque**2).mean(axis=(0, 1), dtype=float))
 
 
 def settled(torque: Floats, ratings: Ratings, ambient: float) -> Floats:
-    """(D,) [deg C] that windings reach in the end at the RMS ``torque`` (D,) in a room of ``ambient`` [deg C]."""
+    """(D,) [deg C] steady-state winding temperature for the RMS ``torque`` (D,) at ``ambient`` [deg C]."""
     return ambient + (torque / ratings.motor_constant) ** 2 * ratings.thermal_resistance
 
 
 def seconds_until_hot(torque: Floats, ratings: Ratings, ambient: float) -> Floats:
-    """(D,) [s] until a winding that begins at ``ambient`` has HOT; infinite if it never does, NaN if unknown.
+    """(D,) [s] time for a winding to heat from ``ambient`` to HOT; infinite if it never does, NaN if unknown.
 
-    First order: thermal_time * dT/dt = settled - T. Its strides must be short beside ``thermal_time``, as they are.
+    First-order model: thermal_time * dT/dt = settled - T. It assumes a ``thermal_time`` much longer than a stride.
     """
     rise, room = settled(torque, ratings, ambient) - ambient, HOT - ambient
     share = room / np.maximum(rise, 1e-9)
@@ -56,9 +56,9 @@ def seconds_until_hot(torque: Floats, ratings: Ratings, ambient: float) -> Float
 
 
 def highest_torque(speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
-    """(T, N, D) [N m] that a motor can push with at ``speed`` along its motion: flat to the knee, then a line to 0.
+    """(T, N, D) [N m] largest driving torque at ``speed``: constant up to knee_speed, then linear to 0 at top_speed.
 
-    ``limit`` (D,): the simulation's torque limits, where no peak torque is known.
+    ``limit`` (D,): the simulation's torque limits, used if the peak torque is unknown.
     """
     peak = np.where(np.isnan(ratings.peak_torque), limit, ratings.peak_torque)
     top = np.where(np.isnan(ratings.top_speed), np.inf, ratings.top_speed)
@@ -69,9 +69,9 @@ def highest_torque(speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
 
 
 def at_limit(torque: Floats, speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
-    """(D,) Share of time at the torque-speed limit or beyond; NaN for a motor without any limit.
+    """(D,) Share of time at or above the torque-speed limit; NaN for a motor without a limit.
 
-    A motor that brakes has ``limit`` (D,) at any speed.
+    For a braking motor the limit is ``limit`` (D,) at any speed.
     """
     most = np.where(torque * speed > 0.0, highest_torque(speed, ratings, limit), limit)
     share = (np.abs(torque) >= AT_LIMIT * most).mean(axis=(0, 1))
@@ -80,9 +80,9 @@ def at_limit(torque: Floats, speed: Floats, ratings: Ratings, limit: Floats) -> 
 
 
 def power(torque: Floats, speed: Floats, ratings: Ratings) -> Floats:
-    """(T, N) [W] from the battery: motion and the windings' heat, where a motor constant is known.
+    """(T, N) [W] power from the battery: mechanical power, and heat in windings with a known motor constant.
 
-    Motors that brake feed the others; what is left over does not count as given back.
+    Braking motors supply the others. A negative sum counts as 0: the battery is not charged.
     """
     heat = np.nan_to_num((torque / ratings.motor_constant) ** 2)
     return np.maximum((torque * speed + heat).sum(axis=2), 0.0)

@@ -1,7 +1,6 @@
-"""A motor as a small neural network: from a joint's recent position errors and speeds to its torque.
+"""A small neural network as motor model: it computes a joint's torque from recent position errors and speeds.
 
-All joints share one network. It is read from an .npz without running code; envs/motors.py and deploy/contract.py
-run it.
+All joints use the same network. Reading its .npz runs no code. envs/motors.py and deploy/contract.py evaluate it.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[Any]  # float32
 ACTIVATIONS = ("elu", "relu", "softsign", "tanh")
-DC_RESISTANCE, DC_CONSTANT, DC_STIFFNESS, DC_DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
+DC_RESISTANCE, DC_CONSTANT, DC_STIFFNESS, DC_DAMPING = 0, 1, 4, 6  # indices in actuator_gainprm of MuJoCo's DC motor
 _RECURRENT = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _SCALES = ("error_scale", "speed_scale", "torque_scale")
 
@@ -28,9 +27,9 @@ _SCALES = ("error_scale", "speed_scale", "torque_scale")
 class MotorNetwork:
     """LSTM layers, if any, then linear layers with an activation between them. Weights are (out, in), as in torch.
 
-    Input of a joint: error_scale * (target - angle) [rad] at each of ``frames``, then speed_scale * speed [rad/s] at
-    each; with ``in_turns`` error and speed alternate. ``frames`` are ages in simulation steps, 0 is now. Output: torque
-    [N m], times torque_scale.
+    Input of a joint: error_scale * (target - angle) [rad] of all ``frames``, then speed_scale * speed [rad/s] of all
+    ``frames``; with ``in_turns`` error and speed alternate. ``frames``: ages in simulation steps, 0 is now. Output x
+    torque_scale: torque [N m].
     """
 
     recurrent: list[tuple[Floats, Floats, Floats, Floats]]  # (4 H, in), (4 H, H), (4 H,), (4 H,); gates i, f, g, o
@@ -44,11 +43,11 @@ class MotorNetwork:
 
     @property
     def hidden(self) -> list[int]:
-        """Units of each LSTM layer."""
+        """Number of units of each LSTM layer."""
         return [layer[1].shape[1] for layer in self.recurrent]
 
     def to_arrays(self) -> dict[str, Any]:
-        """The arrays of its .npz."""
+        """Name -> array, for the .npz."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in ("activation", "in_turns", *_SCALES)}
         for i, layer in enumerate(self.recurrent):
             arrays |= {f"{name}_l{i}": value for name, value in zip(_RECURRENT, layer, strict=True)}
@@ -58,7 +57,7 @@ class MotorNetwork:
 
 
 def read_network(file: Path) -> MotorNetwork:
-    """The network in ``file``. Raises UserError if it holds none."""
+    """Read the network in ``file``. Raises UserError if the file has none."""
     try:
         arrays = read_arrays(file)
     except ValueError:
@@ -100,7 +99,7 @@ def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
 
 
 def _take(arrays: Mapping[str, Any], name: str, *shape: int) -> Floats:
-    """The array ``name``, which must have this ``shape``; -1 is any size."""
+    """The array ``name``. Raises ValueError if it is missing, not finite or not of ``shape``; -1: any size."""
     if name not in arrays:
         raise ValueError(f"array '{name}' is missing")
     value = np.asarray(arrays[name], dtype=np.float32)

@@ -1,6 +1,6 @@
-"""The core's one door to legged_mw/fast, the package that makes a step faster.
+"""The core's only access to legged_mw/fast, the package that makes a step faster.
 
-The core runs without that package and imports nothing from it: ``fast`` loads its modules by name, if they exist.
+The core runs without that package. It imports nothing from it; ``fast`` loads its modules by name if they exist.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import legged_mw
 P = ParamSpec("P")
 R = TypeVar("R")
 
-traces: list[Any] = []  # running traces of fast/trace.py, the innermost last
+traces: list[Any] = []  # active traces of fast/trace.py, innermost last
 
 
 def tracing() -> bool:
-    """Whether a trace is running."""
+    """Whether a trace is active."""
     return bool(traces)
 
 
 def not_traced(method: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a method that a trace must not look into: the traced step calls it every time."""
+    """Decorate a method whose body is not traced: the compiled step calls the method itself."""
 
     @wraps(method)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
@@ -36,9 +36,9 @@ def not_traced(method: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def fast(module: str) -> Any:
-    """The module legged_mw.fast.``module``, or None without the package. Errors inside of the module are raised."""
-    # look in this project alone: another legged_mw may be installed
+    """The module legged_mw.fast.``module``, or None without the package. Import errors of the module are raised."""
+    # search only this project, because another legged_mw may be installed
     package = PathFinder.find_spec("legged_mw.fast", legged_mw.__path__)
-    if package is None or package.origin is None:  # no folder, or one without source files
+    if package is None or package.origin is None:  # no folder, or a folder without source files
         return None
     return import_module(f"legged_mw.fast.{module}")

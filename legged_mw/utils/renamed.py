@@ -1,8 +1,8 @@
-"""Old names: modules that moved, and tensors that legged_gym calls differently."""
+"""Old names: modules that moved, and tensors with another name in legged_gym."""
 
 from __future__ import annotations
 
-# A module, or a class, that a task or an old run's config may name -> its module now.
+# Old module, or class, in a task or the config of an old run -> its module now.
 MOVED: dict[str, str] = {
     "legged_mw.rl.distillation": "legged_mw.rl.students.distillation",
     "RobotTaskCfgPPO": "legged_mw.rl.learner_config",
@@ -15,7 +15,7 @@ MOVED: dict[str, str] = {
     "legged_mw.envs.skill_config": "legged_mw.skills.skill_config",
 }
 
-# A tensor that a class ported from legged_gym may read -> its name here. docs/from_legged_gym.md
+# Tensor of legged_gym -> its name here (docs/from_legged_gym.md).
 LEGGED_GYM_TENSORS: dict[str, str] = {
     "root_states": "root_pos, root_quat (w, x, y, z), root_lin_vel, base_ang_vel",
     "base_quat": "root_quat (w, x, y, z)",

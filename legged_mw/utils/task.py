@@ -1,4 +1,4 @@
-"""Find a task, by its name in ``configs/`` or by the path of its config file, and hold its two configs as one."""
+"""Load a task by its name in ``configs/`` or the path of its config file, and access its two configs as one."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ from legged_mw.utils.errors import UserError, in_short, shown, unknown, users_fa
 from legged_mw.utils.files import file_of, typed
 
 _ENDS = "must end with TASK = Task(Env, Cfg, CfgPPO)"
-PRESETS = "base"  # configs/base.py: no task, but presets that tasks extend
+PRESETS = "base"  # configs/base.py: not a task, but presets that tasks extend
 ROBOT_FILES = (".xml", ".mjcf", ".urdf")
 _SHIPPED = (ROOT / "configs").resolve()
-_packages: dict[tuple[Path, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its imported modules
-_beside: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> the imported modules beside it
+_packages: dict[tuple[Path, ...], dict[str, ModuleType]] = {}  # folders of the package `configs` -> imported modules
+_beside: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> imported modules in it
 
 
 class Task(NamedTuple):
-    """The last line of a config file: three classes, and the exam of the policies."""
+    """The last line of a config file: three classes, and the exam."""
 
-    env: type[Any]  # the environment, a RobotTask
-    cfg: type[Any]  # its config
-    train: type[Any]  # the learner's config
-    exam: str | None = None  # a kind of exam, "" for none; None: that of the environment's class
+    env: type[Any]  # class of the environment, a RobotTask
+    cfg: type[Any]  # class of its config
+    train: type[Any]  # class of the learner's config
+    exam: str | None = None  # kind of exam; "": no exam; None: the exam of the environment's class
 
 
 class LoadedTask:
-    """A task with fresh instances of its configs: ``cfg`` for the environment, ``train`` for the learner.
+    """A task with new instances of its configs: ``cfg`` for the environment, ``train`` for the learner.
 
-    Both share one name space of sections: ``set`` takes a path, ``update`` a mapping, into either of them.
+    The sections of both have different names, so ``set`` and ``update`` accept fields of both.
     """
 
     def __init__(self, name: str, path: Path, task: Task, about: str = "") -> None:
         self.name, self.path, self.env_class = name, path, task.env
-        self.about = about  # the config file's first line
+        self.about = about  # first line of the config file
         self.exam: str = getattr(task.env, "exam", "") if task.exam is None else task.exam
         self.cfg, self.train = task.cfg(), task.train()
         self.cfg._folder = str(path.resolve().parent)  # for find_file of utils/files.py
 
     def set(self, path: str, value: Any, where: str = "--set") -> None:
-        """Override the field at a dotted path. Text is read by the field's type."""
+        """Override the field at a dotted path. Text is parsed by the field's type. Raises ConfigError."""
         section = path.split(".")[0]
         self._owner(section, where).set(path, value, where=where)
 
     def update(self, values: Mapping[str, Any], where: str) -> None:
-        """Override all fields in the nested ``values``, of both configs, or none if one is wrong."""
+        """Override all fields of both configs in the nested ``values``. If one is wrong, change nothing and raise."""
         parts: dict[Config, dict[str, Any]] = {self.cfg: {}, self.train: {}}
         for section, fields in values.items():
             if section != "task":
@@ -68,14 +68,15 @@ class LoadedTask:
             raise
 
     def changes_since(self, before: LoadedTask) -> dict[str, tuple[Any, Any]]:
-        """Dotted path -> (value in ``before``, value now) of all fields that differ from a copy of this task."""
+        """Dotted path -> (value in ``before``, value now), for all fields that differ. ``before``: the same task."""
         differences = [*before.cfg.diff(self.cfg), *before.train.diff(self.train)]
         return {path: (then, now) for path, then, now in differences}
 
     def to_dict(self) -> dict[str, Any]:
-        """Both configs and the task's name as one mapping, for ``config.yaml`` in a run's folder.
+        """Both configs and the task's name as one mapping, for ``config.yaml`` in a run folder.
 
-        A file outside of configs/ is named by its path from the current folder: the file and logs/ can move together.
+        The name of a file outside of configs/ is its path relative to the current folder, so that the file and logs/
+        can be moved together.
         """
         name, here, file = self.name, Path.cwd().resolve(), self.path.resolve()
         if not self.ships:
@@ -84,13 +85,13 @@ class LoadedTask:
         return {"task": name, **self.cfg.to_dict(), **self.train.to_dict()}
 
     def file_called(self, name: str) -> Path | None:
-        """The file of this ``name`` that is the task's own, or of a config that it extends."""
+        """The file with this ``name``, if it is the task's file or that of a config that it extends; else None."""
         kinds = (*type(self.cfg).__mro__, *type(self.train).__mro__)
         return next((file for file in (self.path, *map(file_of, kinds)) if file and file.name == name), None)
 
     @property
     def ships(self) -> bool:
-        """Whether the file is in configs/, so that ``--task`` takes its bare name."""
+        """Whether the file is in configs/, so that ``--task`` accepts its name without a path."""
         return self.path.parent.resolve() == _SHIPPED
 
     def _owner(self, section: str, where: str) -> Config:
@@ -101,15 +102,16 @@ class LoadedTask:
 
 
 def task_names() -> list[str]:
-    """All tasks in configs/."""
+    """The names of all tasks in configs/."""
     names = [path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_")]
     return sorted(name for name in names if name != PRESETS)
 
 
 def load_task(name: str, say: bool = False) -> LoadedTask:
-    """The task ``name`` in ``configs/``, or in the config file at that path; ``say``: print that path before it runs.
+    """Load the task ``name``: a name in ``configs/`` or the path of a config file. Raises ConfigError.
 
-    The file may import its neighbours. A relative ``asset.file`` is looked for as ``find_file`` says.
+    ``say``: print the path of a file before it runs. The file may import modules in its folder. ``find_file`` finds a
+    relative ``asset.file``.
     """
     path, known = typed(name), task_names()
     if path.suffix in ROBOT_FILES:
@@ -155,12 +157,12 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
 
 
 # ---- importing a task's file ---------------------------------------------------------------------------------------
-# A file may import its neighbours by their names, and configs/ as the package `configs`. Two tasks in different folders
-# may have neighbours of the same name, so each folder keeps its own modules. `sys.path` is unchanged afterwards.
+# A file may import modules in its folder by their names, and configs/ as the package `configs`. Two folders may have
+# modules with the same name, so the modules of each folder are kept separately. `sys.path` is restored afterwards.
 
 
 def import_task(path: Path) -> ModuleType:
-    """The module of a config file. Those in configs/ are imported by name, so that they can subclass one another."""
+    """Import a config file. Files in configs/ are imported by name, so that they can extend each other."""
     folder = path.resolve().parent
     beside = folder if folder.name == "configs" else folder / "configs"
     places = (beside, _SHIPPED) if beside.is_dir() and beside != _SHIPPED else (_SHIPPED,)
@@ -176,7 +178,7 @@ def import_task(path: Path) -> ModuleType:
             sys.modules["configs"] = ModuleType("configs")
             sys.modules["configs"].__path__ = [str(place) for place in places]
         sys.path.insert(0, str(folder))
-        importlib.invalidate_caches()  # the file may be a moment old
+        importlib.invalidate_caches()  # the file may be new
         try:
             return importlib.import_module(f"configs.{path.stem}") if folder == _SHIPPED else _run(path)
         finally:
@@ -188,13 +190,13 @@ def _run(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # annotations are resolved through it
+    sys.modules[spec.name] = module  # the resolution of annotations needs it
     spec.loader.exec_module(module)
     return module
 
 
 def _may_be_neighbour(name: str, folder: Path) -> bool:
-    """Whether an import of ``name`` may take the file in ``folder``: no library or imported neighbour has the name."""
+    """Whether an import of ``name`` may use the file in ``folder``: no library or loaded module has the name."""
     if name in sys.stdlib_module_names or name in ("__main__", "legged_mw", "configs"):
         return False
     if name not in sys.modules:
@@ -205,10 +207,11 @@ def _may_be_neighbour(name: str, folder: Path) -> bool:
 
 @contextmanager
 def _modules(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, ...] = ()) -> Iterator[None]:
-    """Inside, the imported modules called ``names`` are ``mine``; modules imported inside are added to ``mine``.
+    """A context in which modules called ``names`` are those in ``mine``. Modules imported in it are added to ``mine``.
 
-    Afterwards names go back to the modules that had them outside of tasks, and ``configs`` to another package of that
-    name on the path. Other names stay until the next task needs them, since a config may name a class by its module.
+    Afterwards the modules that do not belong to tasks are restored, and ``configs`` is free for another package of that
+    name on the path. Other modules stay until the next task needs their names, because a config may name a class by its
+    module.
     """
     before = _take_out(names)
     sys.modules.update(mine)
@@ -226,7 +229,7 @@ def _modules(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, .
 
 
 def _take_out(names: set[str]) -> dict[str, ModuleType]:
-    """Remove the modules called ``names``, and their submodules, from the imported ones; return them."""
+    """Remove the modules called ``names`` and their submodules from ``sys.modules``, and return them."""
     return {name: sys.modules.pop(name) for name in [*sys.modules] if _top(name) in names}
 
 
