@@ -27,7 +27,7 @@ _PLAIN = {"str": str, "bool": bool, "sequence": types.sequence[types.byte]}
 
 
 def _make(package: str, name: str, made: dict[str, Any]) -> Any:
-    """Build one struct. ``made`` holds its inner structs."""
+    """Make one struct. ``made``: its inner structs."""
     members = {}
     for field in fields(package, name):
         kind = made.get(field.type) or _PLAIN.get(field.type) or getattr(types, field.type)
@@ -58,7 +58,7 @@ def _raw(base: Any, size: int) -> Any:
     def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
         body = bytes(data[4 if has_header else 0 :])
         little = not has_header or data[:2] == HEADER[:2]
-        return cls(body[:size] if little else b"")  # another encoding shows as a message of the wrong size
+        return cls(body[:size] if little else b"")  # another encoding gives a message of a wrong size
 
     def deserialize_key(cls: Any, *_: Any, **__: Any) -> Any:
         return cls(b"")  # the writer has left
@@ -88,7 +88,7 @@ def hashes() -> dict[tuple[str, str], str]:
 
 
 def wrong_hash() -> str:
-    """The first type with a hash that differs from the robots', in words; empty if all match."""
+    """Text on the first type whose hash differs from the robots'; "" if all match."""
     for (package, name), found in hashes().items():
         if found != (right := HASHES[package, name]):
             return f"{package} {name} as {found}, not {right}"
