@@ -110,12 +110,12 @@ def parse() -> tuple[str | None, float, bool]:
 
 
 def main() -> None:
-    asked, seconds, one_line = parse()
+    device_flag, seconds, one_line = parse()
     if one_line:
         print(
             f"go1_flat trains for about {seconds:g} s; paste the next line into an issue", file=sys.stderr, flush=True
         )
-        print(benchmark(pick_device(asked), seconds))
+        print(benchmark(pick_device(device_flag), seconds))
         return
     missing: list[Finding] = []
     sections: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
@@ -131,7 +131,7 @@ def main() -> None:
             print(f"  {'!' if finding.mend else ' '} {finding.what:<14} {finding.said}", flush=True)
             missing += [finding] * bool(finding.mend)
     if seconds > 0 and not any(finding.needed for finding in missing):
-        device = pick_device(asked)
+        device = pick_device(device_flag)
         print(f"\nSpeed on {device}, {seconds:g} s", flush=True)
         for name in SPEED_TASKS:
             print(f"    {name:<14} {speed(name, device, seconds / len(SPEED_TASKS))}", flush=True)
@@ -284,9 +284,11 @@ def _records(device: str) -> str:
 
 def speed(name: str, device: str, seconds: float) -> str:
     """Train a task for ``seconds``. Returns its speed and the estimated time of a whole training as text."""
-    found = measure(name, device, seconds)
-    whole = f"all {found.iterations} iterations in {found.minutes:.0f} min"
-    return f"{found.training:>10,.0f} steps/s, {whole} ({found.worlds} worlds, ready after {found.ready:.0f} s)"
+    measured = measure(name, device, seconds)
+    whole = f"all {measured.iterations} iterations in {measured.minutes:.0f} min"
+    return (
+        f"{measured.training:>10,.0f} steps/s, {whole} ({measured.worlds} worlds, ready after {measured.ready:.0f} s)"
+    )
 
 
 def measure(name: str, device: str, seconds: float, worlds: int = 0) -> Speed:
@@ -354,16 +356,16 @@ def benchmark(device: str, seconds: float) -> str:
 
     what, driver = _processor(device)
     counts = [FEW, 0] if device != "cpu" else [0]
-    found: list[Speed] = []
+    speeds: list[Speed] = []
     for worlds in counts:
         try:
-            found.append(measure("go1_flat", device, seconds / len(counts), worlds))
+            speeds.append(measure("go1_flat", device, seconds / len(counts), worlds))
         except Exception as error:
-            if not found or not out_of_memory(error):
+            if not speeds or not out_of_memory(error):
                 raise
-    last, most = found[-1], "-"  # GiB per 1000 worlds; estimated number of worlds that fit
-    if len(found) > 1:
-        of_one = (last.memory - found[0].memory) / (last.worlds - found[0].worlds)
+    last, most = speeds[-1], "-"  # GiB per 1000 worlds; estimated number of worlds that fit
+    if len(speeds) > 1:
+        of_one = (last.memory - speeds[0].memory) / (last.worlds - speeds[0].worlds)
         free = torch.cuda.mem_get_info(device)[1] / GIB - last.memory
         most = f"{of_one * 1000:.2f}; {last.worlds + free / of_one:,.0f}" if of_one > 0 else "-"
     names = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")

@@ -67,8 +67,8 @@ class Field(NamedTuple):
 
 def fields(package: str, struct: str) -> list[Field]:
     """The fields of a struct, in order."""
-    found = [re.fullmatch(r"(\w+) (\w+)(?:\[(\d+)\])?", text) for text in STRUCTS[package][struct].split(", ")]
-    return [Field(m[1], m[2], int(m[3]) if m[3] else None) for m in found if m]
+    matches = [re.fullmatch(r"(\w+) (\w+)(?:\[(\d+)\])?", text) for text in STRUCTS[package][struct].split(", ")]
+    return [Field(m[1], m[2], int(m[3]) if m[3] else None) for m in matches if m]
 
 
 class Layout:

@@ -101,8 +101,8 @@ class Fault(NamedTuple):
 
 def parse_faults(texts: Sequence[str], joints: Sequence[str]) -> list[Fault]:
     """Parse comma-separated NAME[=VALUE][@SECONDS] texts; returns the faults sorted by time. Raises UserError."""
-    found = [_parse(part, joints) for text in texts for part in text.split(",")]
-    return sorted(found, key=lambda fault: fault.time)
+    faults = [_parse(part, joints) for text in texts for part in text.split(",")]
+    return sorted(faults, key=lambda fault: fault.time)
 
 
 def _parse(text: str, joints: Sequence[str]) -> Fault:

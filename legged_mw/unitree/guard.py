@@ -123,11 +123,11 @@ class Guarded:
             clock,
         )
         self._channel.settimeout(START)
-        said = self._answer()
-        if "error" in said or not said:
+        answer = self._answer()
+        if "error" in answer or not answer:
             self._channel.close()
             why = f"the guard of the wire did not start: it ended, or took longer than {START:g} s; no command was sent"
-            raise RobotError(said.get("error", why))
+            raise RobotError(answer.get("error", why))
         self._channel.settimeout(0.5)
         self._last, self._damping, self._moving = 0.0, b"", False
         self._instead = ""  # why this process damps instead of the guard
@@ -209,23 +209,23 @@ class Guarded:
 
     def close(self, last: bytes) -> str:
         """Returns the guard's report of latencies. Without its answer, why this process damped."""
-        said: dict[str, Any] = {}
-        if asked := bool(last) and not self._instead and self._channel.fileno() >= 0:
+        answer: dict[str, Any] = {}
+        if sends_last := bool(last) and not self._instead and self._channel.fileno() >= 0:
             self._put(CLOSE, 0.0, last)
             self._channel.settimeout(SIGN)
-            if not (said := self._answer()):
+            if not (answer := self._answer()):
                 self._damp_instead(GONE if self._ended() else DEAF)
         end = self._clock() + AFTER
         while self._instead and self._clock() < end:
             self._commander.send(self._damping)
             time.sleep(REPEAT)
-        if asked and not said:
-            said = self._answer()  # a slow guard may answer now
+        if sends_last and not answer:
+            answer = self._answer()  # a slow guard may answer now
         self._channel.close()
         if self.process:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(0.0 if self._instead else AFTER + 2.0)
-        return said.get("report", self._instead if asked else "")
+        return answer.get("report", self._instead if sends_last else "")
 
     def _ended(self) -> bool:
         """True if the guard's end of the channel is closed."""

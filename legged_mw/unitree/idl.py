@@ -37,13 +37,13 @@ def _make(package: str, name: str, made: dict[str, Any]) -> Any:
 
 
 def _types() -> dict[tuple[str, str], Any]:
-    found = {}
+    types_by_name = {}
     for package, structs in STRUCTS.items():
         made: dict[str, Any] = {}
         for name in structs:
             made[name] = _make(package, name, made)
-        found |= {(package, name): made[name] for name in structs}
-    return found
+        types_by_name |= {(package, name): made[name] for name in structs}
+    return types_by_name
 
 
 TYPES: dict[tuple[str, str], Any] = _types()
@@ -80,16 +80,16 @@ RAW: dict[tuple[str, str], Any] = {key: _raw(_copies[key], layout.size) for key,
 
 def hashes() -> dict[tuple[str, str], str]:
     """The complete XTypes hash of each type on the wire."""
-    found = {}
+    by_type = {}
     for key in HASHES:
         TYPES[key].__idl__.populate()
-        found[key] = bytes(TYPES[key].__idl__.get_type_id().get()[1]).hex()
-    return found
+        by_type[key] = bytes(TYPES[key].__idl__.get_type_id().get()[1]).hex()
+    return by_type
 
 
 def wrong_hash() -> str:
     """Text on the first type whose hash differs from the robots'; "" if all match."""
-    for (package, name), found in hashes().items():
-        if found != (right := HASHES[package, name]):
-            return f"{package} {name} as {found}, not {right}"
+    for (package, name), own in hashes().items():
+        if own != (right := HASHES[package, name]):
+            return f"{package} {name} as {own}, not {right}"
     return ""

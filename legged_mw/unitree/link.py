@@ -97,14 +97,14 @@ def claim(interface: str, domain: int, seconds: float) -> socket.socket | None:
     """
     if not sys.platform.startswith("linux"):
         return None
-    held, end = socket.socket(socket.AF_UNIX), clock() + seconds
+    lock, end = socket.socket(socket.AF_UNIX), clock() + seconds
     while True:
         try:
-            held.bind(f"\0legged_mw/{COMMANDS}/{interface}/{domain}")
-            return held
+            lock.bind(f"\0legged_mw/{COMMANDS}/{interface}/{domain}")
+            return lock
         except OSError:
             if clock() >= end:
-                held.close()
+                lock.close()
                 raise RobotError(taken(f"domain {domain} on {interface}")) from None
             time.sleep(0.01)
 
@@ -299,8 +299,8 @@ class Wire(Commander):
     def _program(self) -> str:
         """The name of the program that controls the motors, or "". Raises RobotError."""
         try:
-            said = json.loads(answer := self._ask(CHECK_MODE) or "{}")
-            name = said.get("name", "") if isinstance(said, dict) else None
+            content = json.loads(answer := self._ask(CHECK_MODE) or "{}")
+            name = content.get("name", "") if isinstance(content, dict) else None
         except (ValueError, RecursionError):
             name = None
         if not isinstance(name, str):
@@ -314,15 +314,15 @@ class Wire(Commander):
 
         The call is repeated each second, because an answer is lost if the robot has not discovered this reader yet.
         """
-        asked: set[int] = set()
+        ids: set[int] = set()
         for _ in range(tries):
             request = _request(call)
-            asked.add(request.header.identity.id)
+            ids.add(request.header.identity.id)
             self._requests.write(request)
-            if found := self._until(
-                lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0
+            if answers := self._until(
+                lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in ids], 1.0
             ):
-                return found[0].data
+                return answers[0].data
         raise RobotError(f"the robot's motion service does not answer: {self._sent}; restart the robot")
 
 

@@ -89,7 +89,7 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faul
     gc.freeze()
     gc.disable()
     began = start = time.monotonic()
-    steps = begun = said = 0
+    steps = begun = printed = 0
     try:
         while sim.time < seconds - 1e-9:
             sim.remote = handset.state(sim.time)
@@ -99,9 +99,9 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faul
                 begun += 1
             sim.step()
             latency.watch(sim)
-            for why in list(sim.record.why.values())[said:]:
+            for why in list(sim.record.why.values())[printed:]:
                 print(f"refused: {why}; more of its kind are counted", flush=True)
-            said = len(sim.record.why)
+            printed = len(sim.record.why)
             if sim.acted["kp"].any():
                 upright = min(upright, sim.upright)
             steps += 1
