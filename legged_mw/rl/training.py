@@ -118,7 +118,7 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
         _lock(start).release()  # raise before the environment is made
     for section in update_from_run(task, load_yaml(config), where=shown(config)):
-        print(f"{shown(config)} is older than the section {section}: left as it was then")
+        print(f"{shown(config)} has no section {section}: the run is older than it, so it keeps its defaults")
     return start
 
 
@@ -181,7 +181,7 @@ def advice_on_rate(task: LoadedTask) -> str:
     if not recurrent or bounded or task.train.distillation.teacher:
         return ""
     advice = "--set algorithm.max_learning_rate=1e-3 (docs/training.md, A memory)"
-    return f"a memory loses its way where the learning rate rises far: {advice}\n"
+    return f"note: a recurrent network may fail to learn at a high adaptive learning rate: {advice}\n"
 
 
 def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
