@@ -49,10 +49,10 @@ class BaseTask(VecEnv):
     def remembered(self) -> dict[str, Tensor]:
         """Name of the attribute -> tensor, for all registered tensors."""
         names = {id(value): name for name, value in reversed(vars(self).items())}
-        found: dict[str, Tensor] = {}
+        tensors: dict[str, Tensor] = {}
         for place, kept in enumerate(self._remembered):
-            found |= _tensors(names.get(id(kept), f"buffer {place}"), kept)
-        return found
+            tensors |= _tensors(names.get(id(kept), f"buffer {place}"), kept)
+        return tensors
 
     @property
     def episode_length_buf(self) -> Tensor:

@@ -1,7 +1,7 @@
 """Every field of RobotTask, typed, with unit and source. Tasks override these in configs/.
 
 Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
-"A table a joint" is key -> number: a joint takes its exact name's, else that of the longest key in its name, else "".
+"A table a joint" maps keys to values. A joint has that of its exact name, else of the longest key in it, or of "".
 """
 
 from __future__ import annotations
@@ -66,19 +66,19 @@ class RobotTaskCfg(Config):
         episode_length_s: Seconds = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF or URDF, plain or a vendor's; beside the config that names it, or in the repository
-        imu_site: str = ""  # site or body fixed to the root; empty: "imu" if it is so, else the root's origin [ours]
+        file: str = ""  # MJCF or URDF; relative to the folder of the config file, or to the repository
+        imu_site: str = ""  # site or body fixed to the root; empty: "imu" if it is one, else the root's origin [ours]
         # geoms by name or pattern, or bodies by name (their colliding geoms), that touch the ground
         colliders: Names = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
-        penalize_contacts_on: list[str] = []  # colliders likewise: `collision` counts their bodies on the ground [L]
-        terminate_after_contacts_on: list[str] = []  # colliders likewise: one of them on the ground is a fall [L]
+        penalize_contacts_on: list[str] = []  # as colliders: `collision` counts their bodies on the ground [L]
+        terminate_after_contacts_on: list[str] = []  # as colliders: ground contact of one of them is a fall [L]
         # values to sense for your code, read by `env.sensor(name)`: contact_forces, self_contacts, angular_momentum, or
         # a sensor of the file by name; active reward terms add theirs
         sense: list[str] = []
         held_joints: list[str] = []  # names or patterns of joints that are welded at their default angle
-        # tables a joint that need not name every joint; the others keep the file's
-        effort: dict[str, Positive] = {}  # highest force of the servo, both ways [N m]
+        # tables a joint that may omit joints, which keep the values of the file
+        effort: dict[str, Positive] = {}  # largest torque of the servo, in both directions [N m]
         armature: dict[str, Gain] = {}  # inertia of the rotor at the joint [kg m^2]
         frictionloss: dict[str, Gain] = {}  # dry friction [N m]
         joint_speed_limits: dict[str, Positive] = {}  # the motor's highest speed, for report and rewards only [rad/s]
@@ -86,7 +86,7 @@ class RobotTaskCfg(Config):
     class init_state:
         # root at reset [m]; empty: feet as high as in the keyframe "home" (or the only one), or on the ground
         pos: Place = []
-        # table a joint: the pose of action 0 [rad]; joints without a key: that keyframe's
+        # table a joint: the pose of action 0 [rad]; joints without a key have the angle of that keyframe
         default_joint_angles: dict[str, Angle] = {}
         dof_pos_range: Range = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: Range = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
@@ -107,29 +107,29 @@ class RobotTaskCfg(Config):
         # asset.effort
         stall_torque: dict[str, Positive] = {}  # [N m]
         no_load_speed: dict[str, Positive] = {}  # [rad/s]
-        gear: dict[str, Positive] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the curve is at the joint
+        gear: dict[str, Positive] = {"": 1.0}  # motor speed / joint speed; 1: the curve is at the joint
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
-        network_digest: dict[str, str] = {}  # train.py writes name -> SHA-256 of the file; a changed file is refused
+        network_digest: dict[str, str] = {}  # name -> SHA-256, by train.py; a changed file raises an error
         action_scale: Scale | dict[str, Scale] = 0.5  # target = origin + scale * action [rad, rad/s]; or a table [P]
         # the default pose, the measured angles or the last targets [P]; "speed", of a dc_motor: targets are speeds
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
-        decimation: SmallInt = 5  # simulation steps a control step [P]
+        decimation: SmallInt = 5  # simulation steps per control step [P]
 
     class ratings:
-        """What the motors and the battery bear; empty: unknown. For the exam's heat and power, and for `motor_heat`.
+        """Ratings of motors and battery, for heat and power in the exam and for `motor_heat`; empty: unknown.
 
-        Tables a joint that need not name every joint; all values are at the joint (docs/heat.md).
+        Tables a joint that may omit joints. All values are at the joint (docs/heat.md).
         """
 
-        continuous_torque: dict[str, Positive] = {}  # RMS that it bears for ever [N m]
+        continuous_torque: dict[str, Positive] = {}  # RMS torque without a time limit [N m]
         # torque per root of the heat in the winding: torque constant * gear / sqrt(resistance) [N m/W^0.5]
         motor_constant: dict[str, Positive] = {}
-        thermal_resistance: dict[str, Positive] = {}  # from the winding to the room [K/W]
+        thermal_resistance: dict[str, Positive] = {}  # from the winding to the ambient air [K/W]
         thermal_time: dict[str, Positive] = {}  # time constant of the winding [s]
-        peak_torque: dict[str, Positive] = {}  # up to knee_speed; without it the servo's highest force [N m]
-        knee_speed: dict[str, Positive] = {}  # from here the torque falls to 0 at top_speed [rad/s]
+        peak_torque: dict[str, Positive] = {}  # up to knee_speed; unknown: the servo's largest torque [N m]
+        knee_speed: dict[str, Positive] = {}  # speed from which the largest torque decreases to 0 at top_speed [rad/s]
         top_speed: dict[str, Positive] = {}  # without load [rad/s]
-        battery_power: NonNegative = 0.0  # the most that the battery gives; 0: unknown [W]
+        battery_power: NonNegative = 0.0  # largest power of the battery; 0: unknown [W]
 
     class observations:
         leave_out: dict[str, list[str]] = {}  # group -> rows of the table to drop: {"state": ["base_lin_vel"]}
@@ -143,7 +143,7 @@ class RobotTaskCfg(Config):
     class rewards:
         only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
         clip_termination: bool = False  # True: clip `termination` too: a fall costs nothing [P]; False [L]
-        max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
+        max_reward: Positive = 10000.0  # upper bound of the sum in a step [P]
         # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
         soft_dof_pos_limit: PositiveShare = 0.95
         pose_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `pose` [-]
@@ -185,22 +185,22 @@ class RobotTaskCfg(Config):
         interval: PositiveRange = [1.0, 3.0]  # pause between kicks [s] [P]
         duration: PositiveRange = [0.05, 0.2]  # [s] [P]
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
-        curriculum: bool = False  # a world's dv grows from 0 with the share of an episode that it survives [ours]
-        curriculum_rate: PositiveShare = 0.5  # by this part of the difference at the end of each episode [ours]
-        growth: Shares = []  # kicks grow from none to all between these shares of a training; empty: at once [ours]
-        push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
-        push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
+        curriculum: bool = False  # dv of a world increases from 0 with the survived share of its episodes [ours]
+        curriculum_rate: PositiveShare = 0.5  # change of that level per episode, as a share of the difference [ours]
+        growth: Shares = []  # dv increases from 0 to full between these shares of a training; empty: always full [ours]
+        push: bool = False  # set the root's horizontal velocity to a random one; with or without kicks [L]
+        push_interval_s: Seconds = 15.0  # between pushes, with a separate clock in each world [s] [L]
         max_push_vel_xy: Speed = 1.0  # each axis U(-max, max) [m/s] [L]
-        max_push_ang_vel: Speed = 0.0  # of a push that turns, each axis likewise; 0: it does not [rad/s] [humanoid-gym]
+        max_push_ang_vel: Speed = 0.0  # angular velocity, each axis U(-max, max); 0: none [rad/s] [humanoid-gym]
 
     class domain_rand:
         """What differs between worlds: ends of uniform distributions; an empty list leaves the model's value."""
 
         enable: bool = False  # [P]
-        link_mass: Factors = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
-        base_mass: Offsets = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
+        link_mass: Factors = [0.9, 1.1]  # factor on each link's mass and inertia [P; inertia ours]
+        base_mass: Offsets = [-1.0, 1.0]  # added to the root's mass [kg]; inertia is proportional [P; inertia ours]
         base_com: Places = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
-        armature: Factors = [1.0, 1.05]  # factor on each joint's [P]
+        armature: Factors = [1.0, 1.05]  # factor on each joint's armature [P]
         friction: Frictions = [0.4, 1.0]  # sliding friction of the ground [-] [P]
         contact_time: ContactTimes = []  # time constant of ground contacts (solref) [s]: longer is softer; MuJoCo 0.02
         frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
@@ -208,35 +208,35 @@ class RobotTaskCfg(Config):
         damping: Factors = []  # factor on each joint's damping
         strength: Factors = []  # factor on each motor's force limit, asset.effort or the file's
         encoder_offset: Offsets = [-0.05, 0.05]  # each encoder's reading minus the true angle [rad] [P]
-        stall_torque: Factors = []  # factor on each motor's, of control.stall_torque
-        no_load_speed: Factors = []  # factor on each motor's, of control.no_load_speed
+        stall_torque: Factors = []  # factor on each motor's control.stall_torque
+        no_load_speed: Factors = []  # factor on each motor's control.no_load_speed
         action_delay: StepDelays = []  # control steps from an action to its servo, whole numbers, both ends included
-        delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
+        delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, halves up
         observation_delay: StepDelays = []  # age of the measured rows of `state`, in control steps
         slope: Slopes = []  # [deg] of the plane, downhill along x, in place of terrain.slope; headings are random
         model_factors: dict[str, Factors] = {}  # any other field of the model: a factor per world on all of it
-        redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
+        redraw_at_reset: list[str] = [  # drawn at every reset of a world; others are drawn once, at the start
             *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque"],
             *["no_load_speed", "encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
         ]
-        redraw_iterations: NonNegativeInt = 0  # draw all again every so many iterations, and on resuming; 0: never
-        observe: bool = False  # rows in `privileged_state` with the drawn numbers
+        redraw_iterations: NonNegativeInt = 0  # [iterations] between draws of all values; a resume also draws; 0: never
+        observe: bool = False  # add the drawn values as rows to `privileged_state`
 
     class terrain:
-        friction: NonNegative = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
+        friction: NonNegative = 0.6  # sliding friction of the ground, used instead of the robot's [-] [P]
         condim: Literal[1, 3, 4, 6] = 3  # contact dimensions: 3 is sliding without torsion [P]
         slope: Slope = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it do not
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
-        threads: Threads = 0  # of MuJoCo's own engine; 0: one a core
+        threads: Threads = 0  # of MuJoCo's own engine; 0: one per core
         dt: TimeStep = 0.004  # simulation step [s] [P]
         iterations: SmallInt = 1  # Newton iterations [P]
         ls_iterations: SmallInt = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # [P]; implicitfast: any joint damping is stable
         fuse: bool = True  # compile the step's small operations into few kernels, equal to rounding [ours: docs/lab.md]
-        nconmax: NonNegativeInt = 0  # contacts a world (mujoco_warp); 0: by the model [ours: sim/capacity.py]
-        njmax: NonNegativeInt = 0  # constraint rows likewise: friction, limits, contacts; more cost memory and time
+        nconmax: NonNegativeInt = 0  # contacts per world (mujoco_warp); 0: by the model [ours: sim/capacity.py]
+        njmax: NonNegativeInt = 0  # constraint rows per world: friction, limits, contacts; more need memory and time
 
     class viewer:
         width: Pixels = 1280  # [pixel]

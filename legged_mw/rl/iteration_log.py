@@ -350,10 +350,10 @@ class FiniteCheck:
 
         ``counts``: invalid values in ``steps`` steps of a world; ``wrong``: 1 for each stored column with one.
         """
-        found = self._by_name(counts)
-        warnings = [line for name, count in found.items() if (line := self._warning(name, count, steps))]
-        worst = max(found, key=lambda name: found[name], default="")
-        self._bad_in_a_row = self._bad_in_a_row + 1 if worst and found[worst] > SHARE * steps else 0
+        by_name = self._by_name(counts)
+        warnings = [line for name, count in by_name.items() if (line := self._warning(name, count, steps))]
+        worst = max(by_name, key=lambda name: by_name[name], default="")
+        self._bad_in_a_row = self._bad_in_a_row + 1 if worst and by_name[worst] > SHARE * steps else 0
         self._undone_in_a_row = self._undone_in_a_row + 1 if undone else 0
         if undone:
             self.undone += 1
@@ -365,10 +365,10 @@ class FiniteCheck:
             count = f"{self._undone_in_a_row} in a row, {self.undone} so far"
             warnings.append(f"the update was not finite ({cause}) and is undone: {count}")
             if self._undone_in_a_row >= IN_A_ROW:
-                kept = "the networks are those of the last good one"
-                return warnings, f"{IN_A_ROW} updates in a row were not finite ({cause}); {kept}; {advice}"
+                networks = "the networks are those of the last good one"
+                return warnings, f"{IN_A_ROW} updates in a row were not finite ({cause}); {networks}; {advice}"
         if self._bad_in_a_row >= IN_A_ROW:
-            share = f"{found[worst]:.0f} of {steps} steps of a world, for {IN_A_ROW} iterations"
+            share = f"{by_name[worst]:.0f} of {steps} steps of a world, for {IN_A_ROW} iterations"
             return warnings, f"{worst} is not finite, or beyond {BOUND:g}, in {share}; look at how it is computed"
         return warnings, ""
 
@@ -380,8 +380,8 @@ class FiniteCheck:
         fell, broken = numbers["fell"], numbers["broken"]
         timed_out = numbers["episodes"] - fell - broken
         ends = {"fell": fell, "had a state that is not finite": broken, "timed out": timed_out}
-        said = ", ".join(f"{count:.0f} {end}" for end, count in ends.items() if count)
-        lasted = f"episodes last {numbers['episode_length']:.1f} steps ({said})"
+        causes = ", ".join(f"{count:.0f} {end}" for end, count in ends.items() if count)
+        lasted = f"episodes last {numbers['episode_length']:.1f} steps ({causes})"
         return [f"{lasted}: unless that is meant, nothing can be learned; --check names the rule that ends them"]
 
     def walking(self, numbers: Mapping[str, float], done: float) -> list[str]:
@@ -392,25 +392,25 @@ class FiniteCheck:
         self._looked = True
         if walked >= WALKS:
             return []
-        found = {name[4:]: value for name, value in numbers.items() if name.startswith("rew_") and value < 0.0}
-        penalties = {name: value for name, value in found.items() if name != "termination"}
+        negative = {name[4:]: value for name, value in numbers.items() if name.startswith("rew_") and value < 0.0}
+        penalties = {name: value for name, value in negative.items() if name != "termination"}
         largest = min(penalties, key=lambda name: penalties[name], default="")
         advice = (
             f"raise rewards.scales.tracking_lin_vel{f', or weaken {largest}, the largest penalty' if largest else ''}"
         )
         if (falls := numbers["falls_a_minute"]) > OFTEN:
             advice = f"it falls {falls:.0f} times a minute: weaken perturbation and domain_rand"
-        said = f"after {done:.0%} of the training it walks {walked:.0%} of the command: it stands"
+        warning = f"after {done:.0%} of the training it walks {walked:.0%} of the command: it stands"
         slowly = "" if "command_share" in numbers else ", set commands.curriculum = True"
-        return [f"{said}; {advice}{slowly}, or train longer"]
+        return [f"{warning}; {advice}{slowly}, or train longer"]
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
         """Name -> count, without zeros. For a row with several columns it is the largest count."""
-        found: dict[str, float] = {}
+        largest: dict[str, float] = {}
         for name, count in zip(self._names, counts, strict=True):
             if count:
-                found[name] = max(found.get(name, 0.0), count)
-        return found
+                largest[name] = max(largest.get(name, 0.0), count)
+        return largest
 
     def _warning(self, name: str, count: float, steps: int) -> str:
         """A warning for the first invalid value of a name, and again when the total gets one more digit."""

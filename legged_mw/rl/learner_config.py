@@ -57,11 +57,11 @@ class RobotTaskCfgPPO(Config):
     seed: Seed = 1
 
     class runner:
-        num_steps_per_env: Count = 24  # control steps a world between two updates [P]
-        max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
+        num_steps_per_env: Count = 24  # control steps per world between two updates [P]
+        max_iterations: Count = 300  # [ours: enough to see whether a new robot learns]
         save_interval: Count = 50  # [iterations] between checkpoints
-        keep_checkpoints: NonNegativeInt = 0  # newest ones that stay; 0: all [ours]
-        # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
+        keep_checkpoints: NonNegativeInt = 0  # number of newest checkpoints that are kept; 0: all [ours]
+        # [iterations] between short exams, with one at the end; 0, or over max_iterations: no exams [ours]
         exam_interval: NonNegativeInt = 200
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: FolderPart = ""  # appended to the run folder's time stamp
@@ -82,14 +82,14 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: Sizes = [512, 256, 128]  # [P]
         activation: Activation = "elu"  # [P]
         obs_normalization: bool = True  # [P]
-        # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
+        # only of RNNModel, as the next two fields [ours: three quarters of the cost of an LSTM; R lstm]
         rnn_type: Literal["gru", "lstm"] = "gru"
-        rnn_hidden_dim: Count = 256  # values that a layer remembers [R]
+        rnn_hidden_dim: Count = 256  # size of a layer's hidden state [R]
         rnn_num_layers: SmallInt = 1  # [R]
 
         class distribution_cfg:
             class_name: str = "GaussianDistribution"
-            init_std: Positive = 0.6  # [ours: from 1.0 it thrashes, from 0.4 it may stand for good]
+            init_std: Positive = 0.6  # [ours: with 1.0 the robot thrashes, with 0.4 it may never walk]
             std_type: Literal["scalar", "log"] = "scalar"  # [R]
             std_range: PositiveRange = [1e-6, 1e6]  # [R]
 
@@ -105,10 +105,10 @@ class RobotTaskCfgPPO(Config):
         class concurrent:
             """The actor reads its newest frame and a latent, of a teacher or a student (students/concurrent.py)."""
 
-            # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
+            # groups that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
             groups: list[str] = []
-            teacher_share: PositiveShare = 0.75  # of the worlds, that act by the teacher's latent [CTS]
-            latent_dim: Count = 32  # values of a latent, whose length is 1 [go2_rl_gym]
+            teacher_share: PositiveShare = 0.75  # share of the worlds that act by the teacher's latent [CTS]
+            latent_dim: Count = 32  # size of the latent, which has norm 1 [go2_rl_gym]
             hidden_dims: Sizes = [512, 256]  # of both encoders [go2_rl_gym]
             activation: Activation = "elu"
             learning_rate: PositiveShare = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
@@ -137,7 +137,7 @@ class RobotTaskCfgPPO(Config):
         use_clipped_value_loss: bool = True  # [P]
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
         desired_kl: Positive = 0.01  # between updates, for the adaptive schedule [R]
-        # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
+        # upper bound of the adaptive schedule [R]; for a recurrent network 1e-3: docs/training.md
         max_learning_rate: PositiveShare = MAX_RATE
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
@@ -146,11 +146,11 @@ class RobotTaskCfgPPO(Config):
 
         # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
         teacher: str = ""
-        init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
+        init_std: Positive = 0.1  # of the student's noise during distillation, constant [Isaac Lab]
         # or "Distillation": rsl-rl's own, same results, slower
         class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"
         num_learning_epochs: SmallInt = 5  # [R 1; ours: docs/lab.md]
-        gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
+        gradient_length: Count = 4  # steps per gradient; divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
         learning_rate: PositiveShare = 1e-3  # [R]
         max_grad_norm: NonNegative = 1.0  # 0: no bound [R none; ours: as in PPO]
         loss_type: Literal["mse", "huber"] = "mse"  # [R]
@@ -160,8 +160,8 @@ class RobotTaskCfgPPO(Config):
         """Training that starts from the actor of another run: `train.py --init`."""
 
         policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
-        init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
-        # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+        init_std: Positive = 0.2  # of exploration at the start [ours: less than without a policy, because it can walk]
+        # [iterations] at the start in which only the critic learns, because it starts untrained [ours]
         critic_warmup: Iterations = 20
 
     class anneal:
@@ -174,7 +174,7 @@ class RobotTaskCfgPPO(Config):
         """Values that train.py takes on a CPU; flags override them [ours: docs/lab.md]."""
 
         enable: bool = True
-        envs_per_core: Count = 256  # worlds; the task's own number, if that is less
+        envs_per_core: Count = 256  # worlds per core; the task's number of worlds if that is less
         num_steps_per_env: Count = 16
         num_learning_epochs: SmallInt = 5
         num_mini_batches: Count = 4
@@ -183,15 +183,15 @@ class RobotTaskCfgPPO(Config):
         rnn_hidden_dim: Count = 64  # likewise
         max_iterations: Count = 2600
         overrides: dict[str, Any] = {}  # any field of the task: dotted path -> value
-        # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
+        # torch's threads in an update; 0: one per core, or one if that is faster. Everything else has one
         update_threads: Threads = 0
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. How rows mirror: envs/mirror.py."""
 
-        use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
-        use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
-        mirror_loss_coeff: NonNegative = 0.0  # weight of that pull, mean square over actions [-] [R]
+        use_data_augmentation: bool = False  # also learn from the mirror image of each sample: twice the batch [R]
+        use_mirror_loss: bool = False  # penalise mean actions that differ between a state and its mirror image [R]
+        mirror_loss_coeff: NonNegative = 0.0  # weight of this loss, the mean square over actions [-] [R]
 
     def check(self, num_envs: int) -> None:
         """Raise ConfigError for values that do not fit each other, or the number of worlds."""
@@ -222,8 +222,8 @@ class LeggedRobotCfgPPO(RobotTaskCfgPPO):
 
     class cpu(RobotTaskCfgPPO.cpu):
         overrides = {
-            "commands.keep_probability": [0.7, 0.25, 0.5],  # to turn on the spot is rare otherwise, and learned last
-            "perturbation.curriculum": True,  # the strongest kicks keep a beginner from learning to walk
+            "commands.keep_probability": [0.7, 0.25, 0.5],  # otherwise turns on the spot are rare and learned late
+            "perturbation.curriculum": True,  # an untrained robot does not learn to walk under the strongest kicks
         }
 
 

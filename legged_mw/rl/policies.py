@@ -110,10 +110,10 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Pol
     if run == "shipped":
         return shipped_policy(task, "--compare shipped: ")
     rival = _run_or_export(experiment_folder(task, experiment), run)
-    theirs = str(load_yaml(rival.folder / CONFIG_FILE).get("task", task.name))
-    if Path(theirs).stem != task.name:
+    rival_task = str(load_yaml(rival.folder / CONFIG_FILE).get("task", task.name))
+    if Path(rival_task).stem != task.name:
         raise ConfigError(
-            f"--compare {run} is of task '{theirs}', not '{task.name}': two policies are graded on one task"
+            f"--compare {run} is of task '{rival_task}', not '{task.name}': two policies are graded on one task"
         )
     return rival
 
@@ -124,8 +124,8 @@ def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> PolicyS
     finish_moving(folder)  # of an export whose process was killed
     if (folder / NETWORK_FILE).is_file():
         return PolicySource(check_folder(folder), folder / NETWORK_FILE, shipped=False)
-    found = find_run(experiment, name)
-    return PolicySource(found, find_checkpoint(found, checkpoint), shipped=False)
+    run = find_run(experiment, name)
+    return PolicySource(run, find_checkpoint(run, checkpoint), shipped=False)
 
 
 def shipped_policy(task: LoadedTask, flag: str) -> PolicySource:
@@ -221,16 +221,16 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
         raise ConfigError(f"no policy at {path}") from None
     except Exception:  # errors of protobuf and onnx
         raise ConfigError(f"{path} cannot be read as an ONNX network: it is damaged") from None
-    found = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
-    if not found:
+    parameters = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
+    if not parameters:
         names = ", ".join(list(stored)[:3]) or "none"
         raise ConfigError(
             f"{path} is no network that this project exported: "
             f"its weights are called {names}, not {PREFIX}mlp.0.weight ..."
         )
-    if MEAN in found and STD not in found:
-        found[STD] = _divisor(graph, stored, path) - getattr(policy.obs_normalizer, "eps", 0.0)
-    return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | found
+    if MEAN in parameters and STD not in parameters:
+        parameters[STD] = _divisor(graph, stored, path) - getattr(policy.obs_normalizer, "eps", 0.0)
+    return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | parameters
 
 
 def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
@@ -334,15 +334,15 @@ def keep_teacher(teacher: Trained, run: Path) -> None:
 def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
     """The policy's observations in ``env``, as group TEACHER. Raises ConfigError if a meaning differs."""
     task, kind = policy.task, _class_in(env, policy.task.env_class)
-    found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
+    differences = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
     if kind:
         try:
-            seen = _observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
-            if not (found := _differences(env, task.cfg, seen.rows(TEACHER))):
-                return seen
+            observations = _observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
+            if not (differences := _differences(env, task.cfg, observations.rows(TEACHER))):
+                return observations
         except ConfigError as error:  # a row needs a sensor that is missing here
-            found = [str(error)]
-    raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
+            differences = [str(error)]
+    raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(differences)}")
 
 
 def _layout(row: Row) -> tuple[str, int, int, list[float]]:
@@ -393,34 +393,34 @@ def _in_words(rows: Iterable[Row]) -> str:
 def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
     """Texts of the differences that give actions or ``rows`` of a policy of ``cfg`` another meaning in ``env``."""
     kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
-    found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
+    differences = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
     there, here = (
         ", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table)
     )
-    found.append(_differ("the list of commands", there, here))
-    if any(found):
-        return [text for text in found if text]
+    differences.append(_differ("the list of commands", there, here))
+    if any(differences):
+        return [text for text in differences if text]
     theirs, ours = _as_on_a_plane(env, cfg)._load_robot("mujoco"), env.robot
     if theirs.joint_names != ours.joint_names:
         return [
             f"its robot is another one, with the joints {_few(theirs.joint_names)}; "
             f"here they are {_few(ours.joint_names)}"
         ]
-    found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
+    differences = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
     there, here = (robot.tables["control.action_scale"] for robot in (theirs, ours))
-    found.append(_joint("control.action_scale", ours.joint_names, there, here, ""))
+    differences.append(_joint("control.action_scale", ours.joint_names, there, here, ""))
     there, here = (f"{1.0 / (each.sim.dt * each.control.decimation):g} Hz" for each in (cfg, env.cfg))
-    found.append(_differ("the control rate", there, here))
-    found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
+    differences.append(_differ("the control rate", there, here))
+    differences.append(_differ("asset.imu_site", theirs.imu, ours.imu))
     scan = [row for row in rows if row.name == "height_scan"]
     if scan and not scan[0].value.shape[1]:
-        found.append(
+        differences.append(
             "it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state"
         )
-    found += [
+    differences += [
         _differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))
     ]
-    return [text for text in found if text]
+    return [text for text in differences if text]
 
 
 def _as_on_a_plane(env: RobotTask, cfg: RobotTaskCfg) -> RobotTask:

@@ -71,13 +71,13 @@ def new_run(experiment: Path, run_name: str) -> Path:
 
 def runs(experiment: Path) -> list[Path]:
     """Readable run folders with a checkpoint, sorted by the time of their newest checkpoint, oldest first."""
-    found: dict[Path, int] = {}
+    newest: dict[Path, int] = {}
     for folder in experiment.glob("*"):
         # a link to itself, a folder of another user, a checkpoint that another process deletes now
         with contextlib.suppress(OSError):
-            if there := checkpoints(folder):
-                found[folder] = max(path.stat().st_mtime_ns for path in there.values())
-    return sorted(found, key=lambda folder: found[folder])
+            if saved := checkpoints(folder):
+                newest[folder] = max(path.stat().st_mtime_ns for path in saved.values())
+    return sorted(newest, key=lambda folder: newest[folder])
 
 
 def checkpoints(run: Path) -> dict[int, Path]:
@@ -88,29 +88,29 @@ def checkpoints(run: Path) -> dict[int, Path]:
 
 def find_run(experiment: Path, name: str) -> Path:
     """The run ``name`` in ``experiment`` or at the path ``name``; for "-1" the latest run. Raises ConfigError."""
-    found, given = runs(experiment), typed(name)
+    existing, given = runs(experiment), typed(name)
     if name == "-1":
-        if not found:
+        if not existing:
             raise ConfigError(
                 f"no run with a checkpoint in {experiment}; train first, or name another --experiment_name"
             )
-        return check_folder(found[-1])
+        return check_folder(existing[-1])
     for folder in (experiment / name, given):
         if folder.is_dir() and checkpoints(folder):
             return check_folder(folder)
-    raise ConfigError(unknown("run with a checkpoint", name, [folder.name for folder in found], str(experiment)))
+    raise ConfigError(unknown("run with a checkpoint", name, [folder.name for folder in existing], str(experiment)))
 
 
 def find_checkpoint(run: Path, iteration: int) -> Path:
     """The checkpoint of ``run`` after ``iteration`` iterations; for -1 the newest. Raises ConfigError."""
-    found = checkpoints(run)
-    if not found:
+    existing = checkpoints(run)
+    if not existing:
         raise ConfigError(f"no checkpoint model_<iteration>.pt in {run}")
     if iteration == -1:
-        return list(found.values())[-1]
-    if iteration not in found:
-        raise ConfigError(f"no checkpoint {iteration} in {run}; there are: {', '.join(map(str, found))}")
-    return found[iteration]
+        return list(existing.values())[-1]
+    if iteration not in existing:
+        raise ConfigError(f"no checkpoint {iteration} in {run}; there are: {', '.join(map(str, existing))}")
+    return existing[iteration]
 
 
 def task_of(run: Path, named: LoadedTask | None = None) -> str:
@@ -121,8 +121,8 @@ def task_of(run: Path, named: LoadedTask | None = None) -> str:
     stored = load_yaml(run / CONFIG_FILE).get("task", "")
     if not isinstance(stored, str) or not stored:
         raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
-    if found := of_project(stored) or (named and named.file_called(Path(stored).name)):
-        return str(found)
+    if name := of_project(stored) or (named and named.file_called(Path(stored).name)):
+        return str(name)
     extending = ", or a task that extends its config" if named else ""
     raise ConfigError(f"{shown(run)} is of task {stored[:200]!r}, {somebodys(stored)}{extending}")
 
@@ -319,10 +319,10 @@ def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> l
     base class, as the run had them, not those of the task. Returns the names of these sections.
     """
     saved = _with_new_names(saved)
-    theirs = str(saved.get("task", task.name))
-    if Path(theirs).stem != task.name:
-        what = f"say --task {theirs}" if of_project(theirs) else f"that is {somebodys(theirs)}"
-        raise ConfigError(f"{where} is of task {theirs[:200]!r}, not '{task.name}'; {what}")
+    run_task = str(saved.get("task", task.name))
+    if Path(run_task).stem != task.name:
+        what = f"say --task {run_task}" if of_project(run_task) else f"that is {somebodys(run_task)}"
+        raise ConfigError(f"{where} is of task {run_task[:200]!r}, not '{task.name}'; {what}")
     asset = saved.get("asset")
     if isinstance(asset, dict) and _is_own_file(task, Path(str(asset.get("file", "")))):
         asset["file"] = task.cfg.asset.file
@@ -470,13 +470,13 @@ def check_resume(
     parameters = dict(enumerate(each for group in optimizer.param_groups for each in group["params"]))
     with _part(path, "optimizer_state_dict"):
         saved = {**content["optimizer_state_dict"]}
-        for group, mine in zip(saved["param_groups"], own["optimizer_state_dict"]["param_groups"], strict=True):
+        for group, own_group in zip(saved["param_groups"], own["optimizer_state_dict"]["param_groups"], strict=True):
             # a newer torch may have more options
-            switches = {name: value for name, value in mine.items() if value is None or isinstance(value, bool)}
-            theirs = {**switches, **group}
-            _check_number(theirs["lr"])
-            same = repr({name: theirs[name] for name in mine} | {"lr": mine["lr"]}) == repr(mine)
-            if not same or not theirs["lr"]:
+            switches = {name: value for name, value in own_group.items() if value is None or isinstance(value, bool)}
+            settings = {**switches, **group}
+            _check_number(settings["lr"])
+            same = repr({name: settings[name] for name in own_group} | {"lr": own_group["lr"]}) == repr(own_group)
+            if not same or not settings["lr"]:
                 raise ValueError("other parameters or settings")
         if adam and done and not saved["state"]:
             raise ValueError(f"no state after {done} iterations")

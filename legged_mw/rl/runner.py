@@ -239,8 +239,8 @@ class Runner(OnPolicyRunner):
             policy.train(training)
             policy.reset(hidden_state=memory)  # hidden state of the training worlds
         self.last_exam = self.current_learning_iteration, figures
-        found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
-        self._draw_curves(found, self.current_learning_iteration)
+        values = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
+        self._draw_curves(values, self.current_learning_iteration)
         self.console.exam(self.current_learning_iteration, self.schedule.last, figures)
 
     # ---- the log --------------------------------------------------------------------------------------------------
@@ -315,8 +315,10 @@ class Runner(OnPolicyRunner):
         drawn = curves(numbers, losses, speed, collect, learn, report.total_steps)
         self._draw_curves({**drawn, "Train/undone_updates": float(self._finite_check.undone)}, report.iteration)
         if numbers["overflowed"] and not self._warned_overflow:
-            others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise nconmax and njmax"
-            print(f"WARNING: {self.env.sim.overflow_report() or others}", flush=True)
+            message = (
+                f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise nconmax and njmax"
+            )
+            print(f"WARNING: {self.env.sim.overflow_report() or message}", flush=True)
             self._warned_overflow = True
 
     def _stored_names(self) -> list[str]:
@@ -496,11 +498,11 @@ def make_runner(
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        theirs = acting(teacher, env, [TEACHER]) if teacher else None
+        teacher_network = acting(teacher, env, [TEACHER]) if teacher else None
     except ConfigError as error:
         raise ConfigError(f"the teacher's {error}") from None
     try:
-        settings = adapt(rsl_rl_config(cfg, env), cfg, theirs)
+        settings = adapt(rsl_rl_config(cfg, env), cfg, teacher_network)
         runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None

@@ -118,7 +118,7 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
         _lock(start).release()  # raise before the environment is made
     for section in update_from_run(task, load_yaml(config), where=shown(config)):
-        print(f"{shown(config)} is older than the section {section}: left as it was then")
+        print(f"{shown(config)} has no section {section}: the run is older than it, so it keeps its defaults")
     return start
 
 
@@ -181,7 +181,7 @@ def advice_on_rate(task: LoadedTask) -> str:
     if not recurrent or bounded or task.train.distillation.teacher:
         return ""
     advice = "--set algorithm.max_learning_rate=1e-3 (docs/training.md, A memory)"
-    return f"a memory loses its way where the learning rate rises far: {advice}\n"
+    return f"note: a recurrent network may fail to learn at a high adaptive learning rate: {advice}\n"
 
 
 def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
@@ -267,8 +267,8 @@ def _not_saved(runner: Runner) -> str:
     writer, done = runner.writer, runner.current_learning_iteration
     if not (writer and writer.failed):
         return ""
-    kept = writer.written
-    newest = f"the newest that is written is {shown(kept)}" if kept else "none of this training is written"
+    written = writer.written
+    newest = f"the newest that is written is {shown(written)}" if written else "none of this training is written"
     last = f"the last checkpoint, of iteration {done}"
     return f"{last}, cannot be written to {shown(writer.folder)}: {writer.failed}; {newest}"
 
@@ -283,8 +283,8 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
         raise ConfigError(f"{what} has done {done} iterations of {wanted}; raise --max_iterations to go on")
     if start.checkpoint:
         print(f"resuming {shown(start.checkpoint)}")
-        anew = f"worlds begin anew ({runner.why_not_exact}); networks, counters and curricula go on"
-        print(anew if runner.why_not_exact else "exactly: worlds and generators go on where they were", flush=True)
+        note = f"worlds begin anew ({runner.why_not_exact}); networks, counters and curricula go on"
+        print(note if runner.why_not_exact else "exactly: worlds and generators go on where they were", flush=True)
     return wanted - done
 
 
@@ -381,8 +381,8 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
     """Print the last exam and the next command. Returns whether the training is finished."""
     if runner.last_exam:
         iteration, figures = runner.last_exam
-        said = ", ".join(f"{figure} {value:.3f}" for figure, value in figures.items())
-        print(f"exam after {iteration} iterations: {said}")
+        text = ", ".join(f"{figure} {value:.3f}" for figure, value in figures.items())
+        print(f"exam after {iteration} iterations: {text}")
     flags, schedule, done = _flags(task, folder), runner.schedule, runner.current_learning_iteration
     if runner.stop and done < schedule.last:
         left = f" --max_time {max(1, round(schedule.deadline - time.time()))}s" if schedule.deadline else ""

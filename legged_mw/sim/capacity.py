@@ -1,6 +1,6 @@
 """Count the contacts (``nconmax``) and constraint rows (``njmax``) that a world needs on mujoco-warp.
 
-mujoco-warp allocates them once. With too few it drops contacts and reports it; too many rows cost memory and time.
+mujoco-warp allocates them once. With too few it drops contacts and reports this; too many need memory and time.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from legged_mw.sim.ground import GROUND, PROBE_SPACING
 from legged_mw.sim.surface_points import spheres_on
 
 _TYPE, _EQUALITY = mujoco.mjtGeom, mujoco.mjtEq
-# Contacts of one geom with a plane, as mujoco-warp 4.0.0's collision_primitive.py writes them.
-_ON_PLANE = {_TYPE.mjGEOM_SPHERE: 1, _TYPE.mjGEOM_ELLIPSOID: 1, _TYPE.mjGEOM_CAPSULE: 2}  # others lie on a face: 4
-_ROWS = {1: 1, 3: 4, 4: 6, 6: 10}  # of a contact with a pyramidal cone, by condim
+# Number of contacts of one geom with a plane, as in collision_primitive.py of mujoco-warp 4.0.0.
+_ON_PLANE = {_TYPE.mjGEOM_SPHERE: 1, _TYPE.mjGEOM_ELLIPSOID: 1, _TYPE.mjGEOM_CAPSULE: 2}  # others: 4, on a face
+_ROWS = {1: 1, 3: 4, 4: 6, 6: 10}  # condim -> rows of a contact with a pyramidal cone
 _EQUALITY_ROWS = {_EQUALITY.mjEQ_CONNECT: 3, _EQUALITY.mjEQ_WELD: 6}  # others: 1
-_LEAST = 8  # contacts; they cost little, since all worlds share one buffer of them
-_REST = 0.25  # ours: share of the contacts that links other than the last make at once
+_LEAST = 8  # least number of contacts; they need little memory, because all worlds share one buffer
+_REST = 0.25  # ours: share of their contacts that links have at the same time, except the last links
 
 
 class Capacity(NamedTuple):
-    """Contacts and rows of one world, and where they come from."""
+    """Contacts and rows of one world, and a text on their causes."""
 
     contacts: int
     rows: int
@@ -33,8 +33,9 @@ class Capacity(NamedTuple):
 def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
     """The capacity that ``model`` needs on its plane, or on ``terrain``.
 
-    Assumed: the last link of a limb touches with all its contacts, other links with a quarter. Dry friction and limits
-    take a row a joint. With self-collisions half of the geoms touch another, and as many are near one, a contact too.
+    Assumptions: the last link of a limb has all its contacts, other links a quarter of theirs. Dry friction and limits
+    need one row per joint. With self-collisions half of the geoms touch another geom, and as many are near another
+    geom, which is also a contact.
     """
     geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] and model.geom_conaffinity[geom] & 1]
     last = _last_links(model, {int(model.geom_bodyid[geom]) for geom in geoms})
@@ -53,7 +54,7 @@ def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
 
 
 def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
-    """Those of ``bodies`` that carry no other of them."""
+    """The bodies of ``bodies`` without descendants among them."""
     above: set[int] = set()
     for body in bodies:
         while (body := int(model.body_parentid[body])) > 0:

@@ -27,7 +27,7 @@ class GeomNames:
         A name is first looked up among geoms, then among bodies. ``what``: name of the caller's parameter, for a
         ModelError. A pattern with * or ? does not need to match ``lost`` colliders.
         """
-        found: dict[str, None] = {}
+        matches: dict[str, None] = {}
         geoms = self.colliding if colliding else self.geoms
         for pattern in patterns:
             hits = [name for name in geoms if fnmatchcase(name, pattern)]
@@ -37,8 +37,8 @@ class GeomNames:
                 for name in [name for name in self.lost if fnmatchcase(name, pattern)]:
                     raise ModelError.of((what, self.lost[name]))
                 raise ModelError.of((what, self._no_geom(pattern, geoms, bodies, colliding)))
-            found |= dict.fromkeys(hits)
-        return tuple(found)
+            matches |= dict.fromkeys(hits)
+        return tuple(matches)
 
     def passed_over(self, patterns: Sequence[str]) -> list[str]:
         """A warning for each ``lost`` collider that matches one of ``patterns``."""

@@ -50,10 +50,10 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
             or model.geom_contype[geom] & model.geom_conaffinity[ground]
         )
         if geom != ground and touches:
-            found, radius = spheres_on(model, geom, PROBE_SPACING)
-            geoms += [geom] * len(found)
-            places.append(found)
-            radii += [radius] * len(found)
+            centres, radius = spheres_on(model, geom, PROBE_SPACING)
+            geoms += [geom] * len(centres)
+            places.append(centres)
+            radii += [radius] * len(centres)
     return geoms, np.concatenate([*places, np.zeros((0, 3))]), radii
 
 

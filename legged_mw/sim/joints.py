@@ -38,24 +38,24 @@ def some_joints(
         if key and not any(key in joint for joint in (*joints, *spare)):
             text = unknown("joint", key, joints, "the MJCF")
             raise ModelError.of((what, f"{text} (a key may be a part of a joint's name)"))
-    found = {}
+    values = {}
     for joint in joints:
         fitting = sorted((key for key in table if key in joint), key=len)
         if len(fitting) > 1 and len(fitting[-2]) == len(fitting[-1]):
             both = f"'{fitting[-2]}' and '{fitting[-1]}'"
             raise ModelError.of((what, f"{both} fit joint '{joint}' equally well; add the key '{joint}'"))
         if fitting:
-            found[joint] = float(table[fitting[-1]])
-    return found
+            values[joint] = float(table[fitting[-1]])
+    return values
 
 
 def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()) -> list[float]:
     """Values (D,) of ``joints``. Raises ModelError for joints without a key, and as ``some_joints``."""
-    found = some_joints(table, joints, what, spare)
-    if without := [joint for joint in joints if joint not in found]:
+    values = some_joints(table, joints, what, spare)
+    if without := [joint for joint in joints if joint not in values]:
         missing = f"no value for {', '.join(without)}: none of {list(table)} is a part of these names"
         raise ModelError.of((what, f"{missing}; add keys, or '' for all others"))
-    return list(found.values())
+    return list(values.values())
 
 
 def per_joint_all(

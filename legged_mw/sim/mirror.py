@@ -58,13 +58,13 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
 
 def opposites(robot: RobotModel, name: str, tolerance: float = _TOLERANCE) -> list[str]:
     """Names of the sites, geoms and bodies within ``tolerance`` [m] of the mirror image of ``name``."""
-    model, found = robot.physics, []
+    model, names = robot.physics, []
     data = posed(model, np.zeros(len(robot.joint_names)))
     for kind, places in (("site", data.site_xpos), ("geom", data.geom_xpos), ("body", data.xpos)):
         if (own := mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)) >= 0:
             gaps = np.linalg.norm(places - places[own] * _POLAR, axis=1)
-            found += [getattr(model, kind)(int(i)).name for i in np.flatnonzero(gaps <= tolerance)]
-    return list(dict.fromkeys(filter(None, found)))
+            names += [getattr(model, kind)(int(i)).name for i in np.flatnonzero(gaps <= tolerance)]
+    return list(dict.fromkeys(filter(None, names)))
 
 
 def _pair(

@@ -53,8 +53,8 @@ def add_sensors(
     geom, site = _OBJ.mjOBJ_GEOM, _OBJ.mjOBJ_SITE
     with_ground = {"type": _SENS.mjSENS_CONTACT, "reftype": geom, "refname": GROUND}
     for name in contact_geoms:
-        found = [_FOUND, 0, 1]  # data, no reduction, one slot
-        spec.add_sensor(name=f"contact/{name}", objtype=geom, objname=name, intprm=found, **with_ground)
+        data = [_FOUND, 0, 1]  # data, no reduction, one slot
+        spec.add_sensor(name=f"contact/{name}", objtype=geom, objname=name, intprm=data, **with_ground)
     for name in velocity_sites:
         spec.add_sensor(name=f"linvel/{name}", type=_SENS.mjSENS_FRAMELINVEL, objtype=site, objname=name)
     if imu:

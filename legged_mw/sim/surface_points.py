@@ -14,14 +14,14 @@ from legged_mw.sim.joints import posed
 from legged_mw.utils.errors import ModelError
 
 SPACING = 0.01  # [m] between points, to find the lowest one
-_LEVEL = 0.001  # [m] points less above the lowest one count as lowest, so a flat side gets its site in the middle
+_LEVEL = 0.001  # [m] height of points that count as lowest, so that a flat side has its site in the middle
 Points = NDArray[np.float64]  # (P, 3) [m], in the geom's frame
 
 _KINDS = mujoco.mjtGeom
 
 
 def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points, float]:
-    """Centres of spheres on the surface of ``geom``, at most about ``spacing`` [m] apart, and their radius [m].
+    """Centres of spheres on the surface of ``geom``, with distances up to about ``spacing`` [m], and their radius [m].
 
     A sphere is one sphere, a capsule or a thin rod a row of spheres, other shapes are points. Raises ModelError for
     unknown shapes.
@@ -55,7 +55,7 @@ def _on_cylinder(size: Points, spacing: float) -> list[tuple[float, ...]]:
 
 
 def _on_ellipsoid(size: Points, spacing: float) -> list[tuple[float, ...]]:
-    """Rings around z, stretched along x and y."""
+    """Points on rings around z, scaled along x and y."""
     largest = float(size.max())
     angles = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 2 * max(3, math.ceil(0.5 * math.pi * largest / spacing)) + 1)
     rings = [(math.cos(angle) if abs(angle) < 1.57 else 0.0, math.sin(angle)) for angle in angles]
@@ -92,7 +92,7 @@ def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[
     """Points (P, 3) of ``triangles`` (T, 3, 3) on lines along ``axis``, at ``lines`` (L, 2) ``across`` it."""
     a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     (au, av), (bu, bv), (cu, cv) = a[:, across].T, ab[:, across].T, ac[:, across].T
-    # a triangle parallel to the lines has no area across them, and meets none
+    # a triangle parallel to the lines has no area in the projection, and meets no line
     area = np.where(np.abs(bu * cv - bv * cu) > 1e-12, bu * cv - bv * cu, np.inf)
     u, v = lines[:, :1] - au, lines[:, 1:] - av
     share_b, share_c = (u * cv - v * cu) / area, (v * bu - u * bv) / area
@@ -101,12 +101,12 @@ def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[
 
 
 def _spaced(half: float, spacing: float) -> list[float]:
-    """Evenly spaced places from ``-half`` to ``half`` [m]."""
+    """Evenly spaced values from ``-half`` to ``half`` [m]."""
     return np.linspace(-half, half, max(2, math.ceil(2.0 * half / spacing) + 1)).tolist()
 
 
 def _ring(radius: float, spacing: float) -> list[tuple[float, float]]:
-    """Places around a circle [m]; its middle if the radius is 0."""
+    """Points x, y on a circle [m]; its centre if the radius is 0."""
     count = max(12, 4 * math.ceil(0.5 * math.pi * radius / spacing)) if radius else 1
     return [(radius * math.cos(a), radius * math.sin(a)) for a in (2.0 * math.pi * i / count for i in range(count))]
 
@@ -120,11 +120,11 @@ _POINTS: dict[int, Callable[[Points, float], list[tuple[float, ...]]]] = {
 }
 
 
-# ---- lowest points, and sites that a file lacks
+# ---- lowest points, and new sites
 
 
 def surfaces(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> dict[str, Points]:
-    """Points on the undersides of geoms, by name [m, world frame]."""
+    """Geom -> points on its underside [m, world frame]."""
     points: dict[str, Points] = {}
     for name in geoms:
         geom = model.geom(name).id
@@ -136,9 +136,10 @@ def surfaces(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -
 def add_sites(
     spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: Sequence[float], where: str, notes: list[str]
 ) -> None:
-    """Add each site (name -> geoms) that ``spec`` lacks, with the joints at ``angles`` (D,) [rad].
+    """Add the sites (name -> geoms) that are not in ``spec``, at the joint angles ``angles`` (D,) [rad].
 
-    A site of one geom is at its centre. A site of several is in the middle of their lowest points, on the lowest body.
+    A site of one geom is at its centre. A site of several geoms is in the middle of their lowest points, on the lowest
+    body. Raises ModelError for a missing site without geoms.
     """
     missing = {name: geoms for name, geoms in sites.items() if spec.site(name) is None}
     if not missing:
@@ -159,9 +160,9 @@ def add_sites(
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> tuple[str, np.ndarray]:
-    """The geom that reaches lowest, and the middle of the lowest points on its body [m, body frame]."""
+    """The geom with the lowest point, and the middle of the lowest points of its body [m, body frame]."""
     points = surfaces(model, data, geoms)
-    lowest = min(points, key=lambda name: round(points[name][:, 2].min(), 6))  # the first, of equally low ones
+    lowest = min(points, key=lambda name: round(points[name][:, 2].min(), 6))  # the first one of equal height
     body = model.geom(lowest).bodyid[0]
     there = np.concatenate([places for name, places in points.items() if model.geom(name).bodyid[0] == body])
     low = there[there[:, 2] < there[:, 2].min() + _LEVEL]

@@ -1,6 +1,6 @@
-"""legged-mw doctor: what this machine has, what it lacks and the command that mends it, and how fast it trains.
+"""legged-mw doctor: show what this machine has, what is missing with the command that fixes it, and how fast it trains.
 
-With --benchmark one line instead, a row of the table in docs/your_gpu.md, to paste into an issue.
+With --benchmark it prints one line instead, a row of the table in docs/your_gpu.md, to paste into an issue.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from legged_mw.envs.robot_task import RobotTask
 
 SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")
-FEW = 1024  # worlds on a GPU, besides the default: two numbers give the memory of one world
+FEW = 1024  # worlds of a second measurement on a GPU: the difference gives the memory per world
 GIB = 2**30
-# used if legged_mw is on the path but not installed
+# for a legged_mw that is on the path but not installed
 _LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict")
 _CUDA_WHEELS = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu130"
 _DRAW = "import mujoco\nc = mujoco.GLContext(64, 64)\nc.make_current()\nmujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
 
 
 class Finding(NamedTuple):
-    """One line of the page. ``mend``: the command or advice that fixes it; empty if nothing is missing."""
+    """One line of the output. ``mend``: the command or advice that fixes it; empty if nothing is missing."""
 
     what: str
     said: str
@@ -49,7 +49,7 @@ class Finding(NamedTuple):
 
 
 class Peak:
-    """The most of a GPU's memory that was in use while this ran, by all processes, as the driver says [byte]."""
+    """Measures the peak memory of a GPU [byte], used by all processes, as the driver reports it."""
 
     def __init__(self, device: str) -> None:
         self.device, self.most = device, 0
@@ -80,19 +80,19 @@ class Peak:
 
 
 class Speed(NamedTuple):
-    """What was measured of a task."""
+    """The measured speed of a task."""
 
     worlds: int
-    ready: float  # [s] until everything was recorded
-    step: float  # steps of all worlds a second, by env.step alone
-    training: float  # the same, with the policy and the update
+    ready: float  # [s] until all graphs are recorded
+    step: float  # [steps/s] of all worlds, env.step only
+    training: float  # [steps/s] of all worlds, with policy and update
     iterations: int  # of a whole training
-    minutes: float  # of a whole training
-    memory: float  # [GiB] the most in use: on a GPU by all processes, on a CPU by this one
+    minutes: float  # estimated, of a whole training
+    memory: float  # [GiB] peak: on a GPU of all processes, on a CPU of this process
 
 
 def parse() -> tuple[str | None, float, bool]:
-    """Parse the flags: the device, the duration of the speed test [s], and whether one line is asked for."""
+    """Parse the flags. Returns the device, the duration of the speed test [s], and whether to print one line only."""
     parser = Parser(prog="legged-mw doctor", description=__doc__, allow_abbrev=False)
     parser.add_argument(
         "--device", metavar="D", help="what to measure on: cuda:0, cpu (default: the GPU if there is one)"
@@ -110,12 +110,12 @@ def parse() -> tuple[str | None, float, bool]:
 
 
 def main() -> None:
-    asked, seconds, one_line = parse()
+    device_flag, seconds, one_line = parse()
     if one_line:
         print(
             f"go1_flat trains for about {seconds:g} s; paste the next line into an issue", file=sys.stderr, flush=True
         )
-        print(benchmark(pick_device(asked), seconds))
+        print(benchmark(pick_device(device_flag), seconds))
         return
     missing: list[Finding] = []
     sections: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
@@ -131,7 +131,7 @@ def main() -> None:
             print(f"  {'!' if finding.mend else ' '} {finding.what:<14} {finding.said}", flush=True)
             missing += [finding] * bool(finding.mend)
     if seconds > 0 and not any(finding.needed for finding in missing):
-        device = pick_device(asked)
+        device = pick_device(device_flag)
         print(f"\nSpeed on {device}, {seconds:g} s", flush=True)
         for name in SPEED_TASKS:
             print(f"    {name:<14} {speed(name, device, seconds / len(SPEED_TASKS))}", flush=True)
@@ -142,11 +142,11 @@ def main() -> None:
         raise SystemExit(1)
 
 
-# ---- what is there
+# ---- the findings
 
 
 def machine() -> Iterator[Finding]:
-    """Python, cores, memory, disk, location of the package."""
+    """Python, cores, memory, disk and location of the package."""
     version = platform.python_version()
     fits = (3, 11) <= sys.version_info[:2] <= (3, 13)
     mend = "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13"
@@ -183,7 +183,7 @@ def training() -> Iterator[Finding]:
 
 
 def gpus() -> Iterator[Finding]:
-    """For each GPU: driver, memory pool, graphs, kernels, other processes."""
+    """Driver, memory pool, graphs, kernels and other processes of each GPU."""
     import torch
 
     from legged_mw.sim.device import device_facts
@@ -245,11 +245,11 @@ def extras() -> Iterator[Finding]:
     yield Finding("git", git or "not installed (a run of a clone then does not keep its diff)")
 
 
-# ---- trying it
+# ---- tests and measurements
 
 
 def draws(name: str) -> str:
-    """The reason why MuJoCo cannot draw with this MUJOCO_GL; "" if it can. Tested in another process: it may crash."""
+    """Why MuJoCo cannot draw with this MUJOCO_GL; "" if it can. The test runs in another process, as it may crash."""
     environment = {**os.environ, "MUJOCO_GL": name}
     environment.pop("PYOPENGL_PLATFORM", None)
     try:
@@ -263,7 +263,7 @@ def draws(name: str) -> str:
 
 
 def _records(device: str) -> str:
-    """Whether torch and warp can record one common CUDA graph, as text."""
+    """Text on whether torch and warp can record a common CUDA graph."""
     import torch
 
     from legged_mw.sim.graph import StepGraph
@@ -277,20 +277,22 @@ def _records(device: str) -> str:
     try:
         for _ in range(5):
             graph()
-    except Exception as error:  # any error of a driver
+    except Exception as error:  # a driver may raise any type
         return f"cannot be recorded: {' '.join(str(error).split())[:100]}"
     return "recorded and replayed" if graph.recorded and int(counter) == 5 else "not replayed"
 
 
 def speed(name: str, device: str, seconds: float) -> str:
-    """Train a task for ``seconds``. Return its speed and the estimated time of the whole training, as text."""
-    found = measure(name, device, seconds)
-    whole = f"all {found.iterations} iterations in {found.minutes:.0f} min"
-    return f"{found.training:>10,.0f} steps/s, {whole} ({found.worlds} worlds, ready after {found.ready:.0f} s)"
+    """Train a task for ``seconds``. Returns its speed and the estimated time of a whole training as text."""
+    measured = measure(name, device, seconds)
+    whole = f"all {measured.iterations} iterations in {measured.minutes:.0f} min"
+    return (
+        f"{measured.training:>10,.0f} steps/s, {whole} ({measured.worlds} worlds, ready after {measured.ready:.0f} s)"
+    )
 
 
 def measure(name: str, device: str, seconds: float, worlds: int = 0) -> Speed:
-    """Train a task, then step it without a policy, ``seconds`` in all. ``worlds``: 0 for the task's own number."""
+    """Train a task, then step it without a policy, for ``seconds`` in total. ``worlds``: 0 for the task's number."""
     import torch
 
     from legged_mw.rl.learner_config import fit_cpu
@@ -306,7 +308,7 @@ def measure(name: str, device: str, seconds: float, worlds: int = 0) -> Speed:
     with contextlib.redirect_stdout(io.StringIO()), peak.watched() if device != "cpu" else contextlib.nullcontext():
         env = task.env_class(task.cfg, device)
         runner = make_runner(env, task.train, None, device)
-        runner.learn(5 if device != "cpu" else 3)  # warm-up: recording; on a CPU a trial of one thread and of all
+        runner.learn(5 if device != "cpu" else 3)  # warm-up: recording, and on a CPU the trial of thread numbers
     start, done = time.perf_counter(), 0
     with contextlib.redirect_stdout(io.StringIO()):
         while done == 0 or time.perf_counter() < begun + 0.8 * seconds:
@@ -323,7 +325,7 @@ def measure(name: str, device: str, seconds: float, worlds: int = 0) -> Speed:
 
 
 def _seconds_of_a_step(env: RobotTask, device: str, seconds: float) -> float:
-    """Duration of env.step with random actions, the mean over ``seconds``."""
+    """Mean duration [s] of env.step with random actions, measured for ``seconds``."""
     import torch
 
     actions, calls, start = 0.3 * torch.randn(env.num_envs, env.num_actions, device=device), 0, time.perf_counter()
@@ -338,7 +340,7 @@ def _seconds_of_a_step(env: RobotTask, device: str, seconds: float) -> float:
 
 
 def _memory() -> float:
-    """The most memory that this process held [GiB]; 0 where the system does not say."""
+    """Peak memory of this process [GiB]; 0 if unknown."""
     if not sys.platform.startswith("linux"):
         return 0.0
     import resource
@@ -347,23 +349,23 @@ def _memory() -> float:
 
 
 def benchmark(device: str, seconds: float) -> str:
-    """``go1_flat`` on this machine, as a row of the table in docs/your_gpu.md."""
+    """Measure ``go1_flat``. Returns a row of the table in docs/your_gpu.md."""
     import torch
 
     from legged_mw.utils.errors import out_of_memory
 
     what, driver = _processor(device)
     counts = [FEW, 0] if device != "cpu" else [0]
-    found: list[Speed] = []
+    speeds: list[Speed] = []
     for worlds in counts:
         try:
-            found.append(measure("go1_flat", device, seconds / len(counts), worlds))
+            speeds.append(measure("go1_flat", device, seconds / len(counts), worlds))
         except Exception as error:
-            if not found or not out_of_memory(error):
+            if not speeds or not out_of_memory(error):
                 raise
-    last, most = found[-1], "-"  # GiB for 1000 worlds more; how many worlds fit by that
-    if len(found) > 1:
-        of_one = (last.memory - found[0].memory) / (last.worlds - found[0].worlds)
+    last, most = speeds[-1], "-"  # GiB per 1000 worlds; estimated number of worlds that fit
+    if len(speeds) > 1:
+        of_one = (last.memory - speeds[0].memory) / (last.worlds - speeds[0].worlds)
         free = torch.cuda.mem_get_info(device)[1] / GIB - last.memory
         most = f"{of_one * 1000:.2f}; {last.worlds + free / of_one:,.0f}" if of_one > 0 else "-"
     names = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
@@ -383,7 +385,7 @@ def benchmark(device: str, seconds: float) -> str:
 
 
 def _processor(device: str) -> tuple[str, str]:
-    """What ``device`` is, how much of it others use, and its driver."""
+    """Texts on ``device`` with its use by others, and on its driver."""
     if device == "cpu":
         lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
         models = [line.partition(": ")[2] for line in lines if line.startswith("model name")]

@@ -1,6 +1,6 @@
-"""Unitree's robots over their low-level DDS interface, each as a ``Robot``, and a simulated robot on the same wire.
+"""Unitree's robots as a ``Robot``, over their low-level DDS interface (the wire), and a simulated robot on the wire.
 
-Only ``idl`` and ``link`` import cyclonedds. Import these two only where the wire is used.
+Only ``idl`` and ``link`` import cyclonedds. Import them only where the wire is used.
 """
 
 from __future__ import annotations
@@ -23,6 +23,6 @@ def need_dds() -> None:
 def clock() -> float:
     """Time [s] from a fixed moment, the same for all processes of a machine.
 
-    On Linux it runs on while the computer sleeps. Setting the date does not change it.
+    On Linux it also runs while the computer sleeps. A change of the date does not change it.
     """
     return time.monotonic() if _CLOCK is None else time.clock_gettime(_CLOCK)

@@ -1,6 +1,6 @@
 """A Unitree robot as a ``Robot``: state messages become measurements, targets become command messages.
 
-Joint names select the motors. ``link`` has the services that must be called before the motors obey.
+Joint names select the motors. ``link`` calls the services that must run before the motors accept commands.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "ac
 
 
 class Owner(Protocol):
-    """The owner of the wire: this process (``Direct``) or the guard's (``guard.Guarded``)."""
+    """The owner of the wire: this process (``Direct``) or the guard process (``guard.Guarded``)."""
 
     def receive(self) -> Any:
-        """The newest state with its stamp; None if none came since the last call."""
+        """The newest state with its stamp; None if no state arrived since the last call."""
 
     def arm(self, damping: bytes) -> None:
-        """Store the command that damps this robot, for a process that can send none."""
+        """Give the owner the command that damps this robot, to be sent if this process fails."""
 
     def send(self, body: bytes, stamp: float, safe: bool) -> None:
         """Send a command computed from the state of ``stamp`` [s]. ``safe``: it may be repeated forever."""
@@ -47,7 +47,7 @@ class Owner(Protocol):
 
 
 class Direct:
-    """A wire in this process without a guard, for tests."""
+    """A wire in this process, without a guard, for tests."""
 
     def __init__(self, wire: Any) -> None:
         self.wire = wire
@@ -71,7 +71,7 @@ class Direct:
 
 
 class UnitreeRobot(Robot):
-    """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate.
+    """A Go2, G1 or H1. Its motors apply the contract's stiffness and damping at their own rate.
 
     Targets are sent unchanged: ``Safety.held`` clips them to the servos' ranges, for every robot.
     """
@@ -90,10 +90,10 @@ class UnitreeRobot(Robot):
     ) -> None:
         """``first``: the robot's last state. ``odometry``: the velocity is estimated from the measurements.
 
-        ``simulated``: each command names the state that it answers. If the first state has no checksum, or no voltage,
-        later ones need none.
+        ``simulated``: each command has the tick of the state that it answers. If the first state has no checksum or no
+        voltage, later states need none.
 
-        Raises RobotError if this is not the contract's robot, or cannot measure the policy's observation.
+        Raises RobotError if this is not the contract's robot, or if it cannot measure the policy's observations.
         """
         self.contract, self._owner, self._clock, self._simulated = contract, owner, clock, simulated
         self.machine = machine_of(contract.joints)
@@ -113,7 +113,7 @@ class UnitreeRobot(Robot):
         check_slots(self.machine, (self._state["motor_state.q"] != 0.0) & (self._state["motor_state.mode"] != 0))
         self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
-        self._left_out = 0  # states since the last good one
+        self._left_out = 0  # states since the last valid one
         self.dropped: Counter[str] = Counter()  # reason -> rejected states
         owner.arm(self._command(kd=damped(contract)))
 
@@ -124,7 +124,7 @@ class UnitreeRobot(Robot):
     @property
     def _voltage(self) -> float:
         """Voltage [V] of the battery."""
-        each = self.machine.package == "unitree_hg"  # each motor reports it
+        each = self.machine.package == "unitree_hg"  # each motor reports its own
         return float(np.median(self._state["motor_state.vol"][self._slots])) if each else float(self._state["power_v"])
 
     def _decoded(self, body: bytes) -> WireMessage:
@@ -151,7 +151,7 @@ class UnitreeRobot(Robot):
         return Measurement(
             lin_vel=np.zeros(3),
             ang_vel=state["imu_state.gyroscope"].astype(float),
-            # Its length is the quaternion's, squared. A quaternion of zeros thus gives no gravity, not a level robot.
+            # Not normalised: a quaternion of zeros gives zero gravity, not that of a level robot.
             gravity=-np.array([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]),
             joint_pos=q,
             joint_vel=dq,
@@ -202,7 +202,7 @@ class UnitreeRobot(Robot):
         )
 
     def _listen(self) -> None:
-        """Take the newest state if it is intact and from the same robot. A simulator without ticks sends 0 there."""
+        """Read the newest state, if it is intact and from the same robot. A simulator without ticks sends 0."""
         if not (received := self._owner.receive()):
             return
         state = self._decoded(received.body)
@@ -211,7 +211,7 @@ class UnitreeRobot(Robot):
             self.dropped["with a wrong checksum"] += 1
             return
         back = (int(self._state["tick"]) - int(state["tick"])) % 2**32 / 1000
-        if 0 < back <= TOO_OLD:  # overtaken by a newer state; a larger step back means another robot
+        if 0 < back <= TOO_OLD:  # an older state arrived late; a larger step back means another robot
             self.dropped["late"] += 1
             return
         if TOO_OLD < back < _WRAP / 2:
@@ -223,7 +223,7 @@ class UnitreeRobot(Robot):
             )
 
     def _command(self, **parts: Floats) -> bytes:
-        """A command with checksum. ``parts`` (D,) of the joints; other values are zero."""
+        """A command with checksum. ``parts``: fields (D,) of the joints; all other fields are zero."""
         machine, command = self.machine, WireMessage(LAYOUTS[self.machine.package, "LowCmd_"])
         used = np.isin(np.arange(machine.slots), self._slots)
         command["motor_cmd.mode"] = np.where(used, [machine.modes.get(i, 1) for i in range(machine.slots)], 0)
@@ -246,7 +246,7 @@ class UnitreeRobot(Robot):
 
 
 def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> None:
-    """Refuse a policy with rows that this robot does not measure, or without angle commands. Raises RobotError."""
+    """Raise RobotError for a policy with rows that this robot does not measure, or without angle commands."""
     if contract.action.origin in ("torque", "speed"):
         raise RobotError(
             f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here"
@@ -272,7 +272,7 @@ def connect(
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine, odometry)
-    read_scene(folder, contract)  # before anything is sent: refuse a scene that is not the contract's
+    read_scene(folder, contract)  # before anything is sent, raise for a scene that does not fit the contract
     domain = default_domain(interface) if domain is None else domain
     late = max(LATE, 1.5 * contract.period)  # allow for a slow policy
     owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)

@@ -1,4 +1,4 @@
-"""Unitree's low-level messages as bytes: fields, their offsets on the wire, and the checksum. No DDS here.
+"""Unitree's low-level messages as bytes: fields, their offsets on the wire, and the checksum. It does not use DDS.
 
 Names, order and widths of the fields follow Unitree's published unitree_sdk2: ``unitree_go`` (Go2, B2, H1),
 ``unitree_hg`` (G1, H1-2), ``unitree_api`` (the motion service). "byte" means IDL's octet; Unitree's Python says uint8.
@@ -67,8 +67,8 @@ class Field(NamedTuple):
 
 def fields(package: str, struct: str) -> list[Field]:
     """The fields of a struct, in order."""
-    found = [re.fullmatch(r"(\w+) (\w+)(?:\[(\d+)\])?", text) for text in STRUCTS[package][struct].split(", ")]
-    return [Field(m[1], m[2], int(m[3]) if m[3] else None) for m in found if m]
+    matches = [re.fullmatch(r"(\w+) (\w+)(?:\[(\d+)\])?", text) for text in STRUCTS[package][struct].split(", ")]
+    return [Field(m[1], m[2], int(m[3]) if m[3] else None) for m in matches if m]
 
 
 class Layout:
@@ -123,7 +123,7 @@ class WireMessage:
     """One message as its bytes on the wire. ``message["motor_state.q"]`` is the field of all motors, copied."""
 
     def __init__(self, layout: Layout, body: bytes | None = None) -> None:
-        """A message of zeros, or of ``body``. Raises ValueError if ``body`` has another size."""
+        """A message of zeros, or with the bytes ``body``. Raises ValueError if ``body`` has a wrong size."""
         if body is not None and len(body) != layout.size:
             raise ValueError(f"a message of {len(body)} bytes, not {layout.size}")
         self.layout = layout
@@ -143,18 +143,18 @@ class WireMessage:
         return self._bytes.tobytes()
 
     def checksum(self) -> int:
-        """The right value of the field ``crc``."""
+        """The correct value of the field ``crc``."""
         image = np.zeros(self.layout.image_size, dtype=np.uint8)
         image[self.layout.in_image] = self._bytes[self.layout.on_wire]
         return crc32(image[:-4])
 
     def seal(self) -> bytes:
-        """The bytes, with the right checksum."""
+        """Set the checksum and return the bytes."""
         self["crc"] = self.checksum()
         return self.body
 
     def intact(self) -> bool:
-        """True if the checksum is right."""
+        """True if the checksum is correct."""
         return self.checksum() == self["crc"]
 
 

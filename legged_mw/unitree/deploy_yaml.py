@@ -18,7 +18,7 @@ from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.files import writable
 
-# what a row is of -> the program's name of it, and its parameters
+# quantity of a row -> name in that program, parameters
 TERMS: dict[str, tuple[str, dict[str, Any]]] = {
     "ang_vel": ("base_ang_vel", {}),
     "gravity": ("projected_gravity", {}),
@@ -31,7 +31,7 @@ RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")  # the program's names of VELOC
 
 
 def write(folder: Path, contract: Contract, out: Path) -> str:
-    """Write both files below ``out``; returns what was written, in words. Raises ContractError for what they cannot say."""
+    """Write both files into ``out``. Returns a message. Raises ContractError for settings that they cannot express."""
     settings = deploy_settings(contract)
     network, config = out / "exported" / NETWORK_FILE, out / "params" / "deploy.yaml"
     for file in (network, config):
@@ -78,7 +78,7 @@ def _term(row: ContractRow) -> tuple[str, dict[str, Any]]:
 
 
 def _check(contract: Contract) -> None:
-    """Raise ContractError for the first thing that unitree_rl_lab's program does not do."""
+    """Raise ContractError for the first setting that unitree_rl_lab's program does not support."""
     measured = [row.measured for row in contract.rows]
     unknown = [row.name for row in contract.rows if row.measured not in TERMS]
     twice = [row.name for row in contract.rows if measured.count(row.measured) > 1]
@@ -96,7 +96,7 @@ def _check(contract: Contract) -> None:
 
 
 def _fix_batch(source: Path, target: Path) -> None:
-    """Copy the network with a batch of 1: the program takes its tensors' shapes from the file."""
+    """Copy the network with a batch of 1, because the program reads tensor shapes from the file."""
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.optimized_model_filepath = str(target)

@@ -23,7 +23,7 @@ def senses_feet(contract: Contract) -> bool:
 
 
 def connect(folder: Path, contract: Contract, args: argparse.Namespace, odometry: bool) -> Robot:
-    """Connect to the robot on the wire."""
+    """Connect to the robot on the wire. Raises RobotError."""
     robot = client.connect(folder, contract, args.interface, args.domain, odometry=odometry)
     print(
         f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V",
@@ -33,7 +33,7 @@ def connect(folder: Path, contract: Contract, args: argparse.Namespace, odometry
 
 
 def serve(folder: Path, contract: Contract, args: argparse.Namespace, lift: float) -> str:
-    """Serve a simulated robot on the wire. ``lift`` [m]: height above its start. Returns a report in words."""
+    """Serve a simulated robot on the wire. ``lift`` [m]: height above its start. Returns a report as text."""
     need_dds()
     from legged_mw.unitree import handset, program
     from legged_mw.unitree.faults import parse_faults

@@ -1,4 +1,4 @@
-"""Faults of a simulated robot and its wire, on demand: ``--serve unitree --fault NAME[=VALUE][@SECONDS]``."""
+"""Faults of a simulated robot and its wire, set by ``--serve unitree --fault NAME[=VALUE][@SECONDS]``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OFF = "off"  # value that ends a fault
 
 @dataclass
 class Faults:
-    """The present faults. They may change at any time."""
+    """The current faults. They may change at any time."""
 
     delay_ms: float = 0.0  # [ms] of every message, each way
     jitter_ms: float = 0.0  # [ms] standard deviation of the delay
@@ -29,10 +29,10 @@ class Faults:
     # frozen parts of the state, by their names in NAN, and joints with frozen encoders
     stuck: set[str] = field(default_factory=set)
     silent: bool = False  # no states are sent
-    no_remote: bool = False  # the remote is off: 40 zeros
-    clock_jump: float = 0.0  # [s] that the robot's clock is ahead
-    mode_machine: int | None = None  # of another body; None: its own
-    joint_order: int = 0  # slots by which the motors' plugs are shifted
+    no_remote: bool = False  # the remote is off, which is 40 zeros
+    clock_jump: float = 0.0  # [s] offset of the robot's clock
+    mode_machine: int | None = None  # sent value; None: the correct one
+    joint_order: int = 0  # number of slots by which the motors' connectors are shifted
     turned_joints: set[str] = field(default_factory=set)  # joints with reversed motors
     dead_motors: set[str] = field(default_factory=set)  # joints with motors that give no torque and report a fault
     joint_bias: Floats | float = 0.0  # (D,) [rad] added to measured angles
@@ -49,7 +49,7 @@ class FaultKind(NamedTuple):
     """A fault that the command line can name."""
 
     field: str  # of Faults
-    value: Any  # without "=VALUE"; None: the value is required
+    value: Any  # default without "=VALUE"; None: the value is required
     low: float = -math.inf
     high: float = math.inf
     unit: str = ""
@@ -101,8 +101,8 @@ class Fault(NamedTuple):
 
 def parse_faults(texts: Sequence[str], joints: Sequence[str]) -> list[Fault]:
     """Parse comma-separated NAME[=VALUE][@SECONDS] texts; returns the faults sorted by time. Raises UserError."""
-    found = [_parse(part, joints) for text in texts for part in text.split(",")]
-    return sorted(found, key=lambda fault: fault.time)
+    faults = [_parse(part, joints) for text in texts for part in text.split(",")]
+    return sorted(faults, key=lambda fault: fault.time)
 
 
 def _parse(text: str, joints: Sequence[str]) -> Fault:
@@ -152,7 +152,7 @@ def _number(text: str) -> float:
 
 
 class Line:
-    """One direction of the wire. Messages come out when due: late, reordered, or never."""
+    """One direction of the wire, which delays, reorders or loses messages."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng, self._queue, self._count = rng, list[tuple[float, int, bytes]](), 0

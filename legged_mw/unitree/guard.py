@@ -1,10 +1,10 @@
 """The guard: a small process that owns the wire. It damps the robot if the policy's process dies, hangs or is late.
 
-The policy's process sends it finished commands and reads back raw states. The guard repeats the newest command at the
-robot's own rate. Once it has damped, it refuses every command: only a person can start again.
+The policy's process sends it complete commands and reads raw states. The guard repeats the newest command at the
+robot's own rate. After it has damped, it rejects all commands; only a person can start again.
 
-On every signal that would end it, the guard damps first. A killed or stopped guard cannot damp. The policy's process
-sees each turn of the guard, so it notices and sends damping itself.
+On every signal that would end it, the guard first damps. A killed or stopped guard cannot damp. The policy's process
+sees the time of the guard's last turn, so it detects this and sends damping itself.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from legged_mw.unitree.codec import LAYOUTS
 
 # [s] ours: limit without a command, three periods at 50 Hz. docs/faults.md has the time until joints are damped
 LATE = 0.06
-# [s] ours: limit between two turns. Beyond it the guard was stopped or this computer slept; the policy's process damps
+# [s] ours: limit between two turns. Longer: the guard was stopped or this computer slept; the policy's process damps
 STILL = 0.04
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: time of damping before the wire is closed
@@ -43,11 +43,11 @@ PRIORITY = 30  # ours, of a real-time process: above the policy's, since the gua
 GONE = "the guard of the wire is gone"
 DEAF = "the guard of the wire does not listen"
 INSTEAD = "this process damps the joints in its place"
-_TURN = 0.001  # [s] longest pause between two looks at the wire
+_TURN = 0.001  # [s] longest time between two turns without messages
 # checksum of the rest, time of the guard's turn, stamp of the state, length of the text, text
 _BOARD = struct.Struct("<IddI512s")
 _SUM = 4  # [byte] of the checksum
-_LOOKS = 10  # reads of a board in the middle of a write, before the last content counts
+_LOOKS = 10  # reads of a board during a write, before the last valid content is used
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
 # Kinds of command. MOVE: the next one must follow in time. SAFE: may be repeated forever. CLOSE: the last one.
 # ARM: stored for a trip, not sent now.
@@ -60,13 +60,13 @@ class Posted(NamedTuple):
     body: bytes  # of the newest state
     stamp: float  # [s] arrival of the state
     text: str  # why the guard damped; "" if it did not
-    turn: float  # [s] when the guard last looked at both sides
+    turn: float  # [s] time of the guard's last turn
 
 
 class Board:
     """Shared memory: the guard writes, the policy's process reads the newest content.
 
-    Content counts only with the right checksum: another processor may see the writes in any order.
+    Content is valid only with a correct checksum, because another processor may see the writes in any order.
     """
 
     def __init__(self, file: int, size: int) -> None:
@@ -74,7 +74,7 @@ class Board:
         self._stamp, self._text, self._posted = 0.0, b"", Posted(bytes(size), 0.0, "", 0.0)
 
     def put(self, turn: float, body: bytes | None = None, stamp: float = 0.0, text: str = "") -> None:
-        """Write. A state and a text stay until the next ones."""
+        """Write. State and text stay until they are written again."""
         if body is not None:
             self._whole[_BOARD.size :], self._stamp = body, stamp
         self._text = text.encode()[:512] if text else self._text
@@ -83,7 +83,7 @@ class Board:
         self._map[:] = self._whole
 
     def get(self) -> Posted:
-        """The newest intact content. During a write, or after one that was cut off, that is the content before."""
+        """The newest valid content. During a write, or after an incomplete one, it is the previous content."""
         for _ in range(_LOOKS):
             whole = self._map[:]
             right, turn, stamp, length, text = _BOARD.unpack_from(whole)
@@ -123,11 +123,11 @@ class Guarded:
             clock,
         )
         self._channel.settimeout(START)
-        said = self._answer()
-        if "error" in said or not said:
+        answer = self._answer()
+        if "error" in answer or not answer:
             self._channel.close()
             why = f"the guard of the wire did not start: it ended, or took longer than {START:g} s; no command was sent"
-            raise RobotError(said.get("error", why))
+            raise RobotError(answer.get("error", why))
         self._channel.settimeout(0.5)
         self._last, self._damping, self._moving = 0.0, b"", False
         self._instead = ""  # why this process damps instead of the guard
@@ -172,7 +172,7 @@ class Guarded:
                 )
         owner = cls(channel, board, commander, process)
         try:
-            commander.wait(2, find)  # two readers: the robot, and the guard, which listens for other commanders
+            commander.wait(2, find)  # two readers: the robot and the guard, which listens for other commanders
         except RobotError:
             owner.close(b"")
             raise
@@ -181,7 +181,7 @@ class Guarded:
     def receive(self) -> Any:
         from legged_mw.unitree.link import Received
 
-        now = self._clock()  # before reading the board, so a pause between the two does not count as the guard's
+        now = self._clock()  # before reading the board, so that a pause here does not count as the guard's
         body, stamp, text, turn = self._board.get()
         silent, known = now - turn, self._instead
         if self._ended():
@@ -189,7 +189,7 @@ class Guarded:
         elif self._moving and silent > STILL:
             self._damp_instead(f"the guard of the wire was silent for {1000 * silent:.0f} ms")
         if text or self._instead:
-            # a running guard takes this process for another program, and says so; report the first cause
+            # a running guard reports this process as another program; raise the first cause
             raise RobotError(known or text or self._instead)
         if stamp == self._last:
             return None
@@ -208,24 +208,24 @@ class Guarded:
             self._commander.send(self._damping)
 
     def close(self, last: bytes) -> str:
-        """Returns the latency of measurements, from the guard. Without its answer: why this process damped."""
-        said: dict[str, Any] = {}
-        if asked := bool(last) and not self._instead and self._channel.fileno() >= 0:
+        """Returns the guard's report of latencies. Without its answer, why this process damped."""
+        answer: dict[str, Any] = {}
+        if sends_last := bool(last) and not self._instead and self._channel.fileno() >= 0:
             self._put(CLOSE, 0.0, last)
             self._channel.settimeout(SIGN)
-            if not (said := self._answer()):
+            if not (answer := self._answer()):
                 self._damp_instead(GONE if self._ended() else DEAF)
         end = self._clock() + AFTER
         while self._instead and self._clock() < end:
             self._commander.send(self._damping)
             time.sleep(REPEAT)
-        if asked and not said:
-            said = self._answer()  # a slow guard may answer now
+        if sends_last and not answer:
+            answer = self._answer()  # a slow guard may answer now
         self._channel.close()
         if self.process:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(0.0 if self._instead else AFTER + 2.0)
-        return said.get("report", self._instead if asked else "")
+        return answer.get("report", self._instead if sends_last else "")
 
     def _ended(self) -> bool:
         """True if the guard's end of the channel is closed."""
@@ -236,7 +236,7 @@ class Guarded:
         return True
 
     def _damp_instead(self, why: str) -> None:
-        """Send damping from this process from now on. A guard that still runs damps, too: see ``WireGuard.turn``."""
+        """Send damping from this process from now on. A guard that still runs also damps, see ``WireGuard.turn``."""
         if self._damping and not self._instead:
             self._instead = f"{why}; {INSTEAD}"
             self._commander.send(self._damping)
@@ -250,7 +250,7 @@ class Guarded:
             self._damp_instead(GONE)
 
     def _answer(self) -> dict[str, Any]:
-        """A line of JSON from the guard; empty if none comes."""
+        """A line of JSON from the guard; empty if no line arrives."""
         data = b""
         with contextlib.suppress(OSError):
             while not data.endswith(b"\n") and (more := self._channel.recv(65536)):
@@ -300,7 +300,7 @@ class WireGuard:
             self.turn()
 
     def turn(self) -> None:
-        """Look at both sides once. New commands come last, since they may have waited while the guard was stopped."""
+        """Check wire and channel once. Commands come last: they may have waited while the guard was stopped."""
         now = self.clock()
         still, self._looked = now - self._looked, now
         if still < 0.0:  # the clock went back: shift all stored times
@@ -325,7 +325,7 @@ class WireGuard:
         self.board.put(now, *(self.wire.receive() or ()))
 
     def _hear(self, now: float) -> None:
-        """Take the messages of the policy's process; the newest command counts."""
+        """Read the messages of the policy's process. The newest command is used."""
         if self.channel.fileno() < 0:
             return
         try:
@@ -365,7 +365,7 @@ class WireGuard:
             self.wire.send(self._command)
 
     def trip(self, why: str) -> None:
-        """Damp from now on and report why; only the first reason counts."""
+        """Damp from now on and report why. Only the first reason is reported."""
         if self._command:
             self._command = self._damping
             self.wire.send(self._command)
@@ -373,7 +373,7 @@ class WireGuard:
             self.tripped, self._moving = why, False
             done = f"{why}; the joints are damped" if self._command else why
             self.board.put(self._looked, text=done)
-            with contextlib.suppress(OSError):  # the terminal is gone
+            with contextlib.suppress(OSError):  # the terminal is closed
                 print(f"guard: {done}", file=sys.stderr, flush=True)
 
     def _report(self) -> str:
@@ -408,7 +408,7 @@ def main() -> None:
     channel = socket.socket(fileno=settings["channel"])
     real_time(PRIORITY, heirs=True)  # before DDS starts its threads
     try:
-        # the guard before this one may still damp
+        # the previous guard may still damp
         claimed = claim(settings["interface"], settings["domain"], 2 * AFTER)
         wire = Wire(settings["package"], settings["interface"], settings["domain"])
         first = wire.prepare(settings["find"], lies_down=settings["lies_down"])

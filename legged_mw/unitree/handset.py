@@ -82,14 +82,14 @@ def _number(value: object) -> bool:
 
 
 class Handset:
-    """The present state of the remote."""
+    """The current state of the remote."""
 
     def __init__(self, script: Sequence[RemoteEvent] = (), keys: bool = False) -> None:
-        """``keys``: read this terminal, which must be one."""
+        """``keys``: read keys from standard input, which must be a terminal."""
         self._script, self._next = list(script), 0
         self._sticks: dict[str, float] = dict.fromkeys(STICKS, 0.0)
         self._buttons, self._until = tuple[str, ...](), -math.inf
-        self.off, self.hoist = False, None  # None: no input named it yet
+        self.off, self.hoist = False, None  # None: no input has set it
         self._keys, self._before = keys, None
         if keys:
             import termios

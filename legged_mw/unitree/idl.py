@@ -27,7 +27,7 @@ _PLAIN = {"str": str, "bool": bool, "sequence": types.sequence[types.byte]}
 
 
 def _make(package: str, name: str, made: dict[str, Any]) -> Any:
-    """Build one struct. ``made`` holds its inner structs."""
+    """Make one struct. ``made``: its inner structs."""
     members = {}
     for field in fields(package, name):
         kind = made.get(field.type) or _PLAIN.get(field.type) or getattr(types, field.type)
@@ -37,13 +37,13 @@ def _make(package: str, name: str, made: dict[str, Any]) -> Any:
 
 
 def _types() -> dict[tuple[str, str], Any]:
-    found = {}
+    types_by_name = {}
     for package, structs in STRUCTS.items():
         made: dict[str, Any] = {}
         for name in structs:
             made[name] = _make(package, name, made)
-        found |= {(package, name): made[name] for name in structs}
-    return found
+        types_by_name |= {(package, name): made[name] for name in structs}
+    return types_by_name
 
 
 TYPES: dict[tuple[str, str], Any] = _types()
@@ -58,7 +58,7 @@ def _raw(base: Any, size: int) -> Any:
     def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
         body = bytes(data[4 if has_header else 0 :])
         little = not has_header or data[:2] == HEADER[:2]
-        return cls(body[:size] if little else b"")  # another encoding shows as a message of the wrong size
+        return cls(body[:size] if little else b"")  # another encoding gives a message of a wrong size
 
     def deserialize_key(cls: Any, *_: Any, **__: Any) -> Any:
         return cls(b"")  # the writer has left
@@ -80,16 +80,16 @@ RAW: dict[tuple[str, str], Any] = {key: _raw(_copies[key], layout.size) for key,
 
 def hashes() -> dict[tuple[str, str], str]:
     """The complete XTypes hash of each type on the wire."""
-    found = {}
+    by_type = {}
     for key in HASHES:
         TYPES[key].__idl__.populate()
-        found[key] = bytes(TYPES[key].__idl__.get_type_id().get()[1]).hex()
-    return found
+        by_type[key] = bytes(TYPES[key].__idl__.get_type_id().get()[1]).hex()
+    return by_type
 
 
 def wrong_hash() -> str:
-    """The first type with a hash that differs from the robots', in words; empty if all match."""
-    for (package, name), found in hashes().items():
-        if found != (right := HASHES[package, name]):
-            return f"{package} {name} as {found}, not {right}"
+    """Text on the first type whose hash differs from the robots'; "" if all match."""
+    for (package, name), own in hashes().items():
+        if own != (right := HASHES[package, name]):
+            return f"{package} {name} as {own}, not {right}"
     return ""

@@ -1,4 +1,4 @@
-"""The wire: a DDS domain on one network interface, and the topics of a Unitree robot. Messages are bytes here."""
+"""The wire: a DDS domain on one network interface, and the topics of a Unitree robot. Messages are bytes."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ SPORT = "rt/api/sport/request"
 CHECK_MODE, RELEASE_MODE = 1001, 1003  # calls of the motion service
 STAND_DOWN = 1005  # call of the sport service [unitree_sdk2]
 LOOPBACK = ("lo", "lo0")
-AGAIN = 0.1  # [s] ours: a robot heard within this time was not restarted
-LEASE = 11.0  # [s] until DDS forgets a killed program: its 10, and a margin
+AGAIN = 0.1  # [s] ours: a restarted robot is silent for longer than this
+LEASE = 11.0  # [s] time until DDS removes a killed program: 10 s and a margin
 _INTERFACE = "<General><Interfaces><NetworkInterface name='{name}' {multicast}/></Interfaces>{more}</General>"
-# Loopback interfaces have no multicast, so the processes search for each other at 127.0.0.1, port by port.
+# Loopback interfaces have no multicast, so the processes search the ports of 127.0.0.1 for each other.
 _LOCAL = "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
 _LOCAL += "<Peers><Peer Address='127.0.0.1'/></Peers></Discovery>"
 # domain -> interface and its Domain object; a process may configure a domain only once
@@ -43,7 +43,7 @@ _joined: dict[int, tuple[str, Any]] = {}
 
 
 def default_domain(interface: str) -> int:
-    """The default domain: 0, a robot's own; on loopback 1, as in unitree_mujoco."""
+    """The default domain: 0, as on a robot; on loopback 1, as in unitree_mujoco."""
     return 1 if interface in LOOPBACK else 0
 
 
@@ -80,9 +80,9 @@ def join(interface: str, domain: int) -> Any:
 
 
 def _joined_by(owner: object, interface: str, domain: int) -> Any:
-    """A participant that leaves when its owner is freed.
+    """A participant that leaves the domain when ``owner`` is freed.
 
-    Without this, cyclonedds never lets a participant leave that the garbage collector finds in a cycle.
+    Otherwise a participant that the garbage collector finds in a cycle never leaves.
     """
     participant = join(interface, domain)
     finalize(owner, participant.__del__).atexit = False
@@ -90,21 +90,21 @@ def _joined_by(owner: object, interface: str, domain: int) -> Any:
 
 
 def claim(interface: str, domain: int, seconds: float) -> socket.socket | None:
-    """Claim the right to command the robot on this interface, for one process of this computer, until it ends.
+    """Reserve the commands of the robot on this interface for this process of the computer, until it ends.
 
-    Listening alone would miss another program that has not sent yet or pauses. Waits ``seconds`` for one that is about
-    to end, then raises RobotError. Systems without abstract sockets have no claim.
+    Listening alone does not detect a program that has not sent yet or pauses. If another process has the claim, wait at
+    most ``seconds`` for its end, then raise RobotError. Systems without abstract sockets have no claim.
     """
     if not sys.platform.startswith("linux"):
         return None
-    held, end = socket.socket(socket.AF_UNIX), clock() + seconds
+    lock, end = socket.socket(socket.AF_UNIX), clock() + seconds
     while True:
         try:
-            held.bind(f"\0legged_mw/{COMMANDS}/{interface}/{domain}")
-            return held
+            lock.bind(f"\0legged_mw/{COMMANDS}/{interface}/{domain}")
+            return lock
         except OSError:
             if clock() >= end:
-                held.close()
+                lock.close()
                 raise RobotError(taken(f"domain {domain} on {interface}")) from None
             time.sleep(0.01)
 
@@ -114,7 +114,7 @@ def taken(where: str) -> str:
 
 
 def _reader(participant: Any, topic: str, kind: Any, depth: int = 1, foreign: bool = False) -> Any:
-    """A reader of the newest ``depth`` samples. ``foreign``: without those of this participant."""
+    """A reader of the newest ``depth`` samples. ``foreign``: without samples of this participant."""
     policies = [Policy.Reliability.BestEffort, Policy.History.KeepLast(depth)]
     policies += [Policy.IgnoreLocal.Participant] if foreign else []
     return DataReader(participant, Topic(participant, topic, kind), Qos(*policies))
@@ -125,10 +125,10 @@ def _writer(participant: Any, topic: str, kind: Any) -> Any:
 
 
 def _taken(reader: Any, count: int = 1) -> list[Any]:
-    """Samples with data; a writer that leaves sends one without. One undecodable sample drops all of this call."""
+    """Samples with data: a writer that leaves sends one without. If one cannot be decoded, all are dropped."""
     try:
         return [sample for sample in reader.take(count) if sample.sample_info.valid_data]
-    except Exception as error:  # cyclonedds' codec may raise anything on bytes that are no message
+    except Exception as error:  # cyclonedds' codec may raise any type on invalid bytes
         if isinstance(error, DDSException):
             raise
         return []
@@ -152,7 +152,7 @@ class Received(NamedTuple):
 
 
 class Commander:
-    """Can only send commands. A policy's process uses it if its guard is gone."""
+    """Sends commands only. A policy's process uses it if its guard has ended."""
 
     def __init__(self, package: str, interface: str, domain: int) -> None:
         self.package, self._where = package, f"domain {domain} on {interface}"
@@ -165,12 +165,12 @@ class Commander:
         self._out.write(self._sample(body))
 
     def wait(self, readers: int, seconds: float) -> None:
-        """Wait until this many ``readers`` read commands, so that none is lost. Raises RobotError after ``seconds``."""
+        """Wait until commands have ``readers`` readers, so that none is lost. Raises RobotError after ``seconds``."""
         if not self._until(lambda: len(self._out.get_matched_subscriptions()) >= readers, seconds):
             raise RobotError(f"no robot reads {COMMANDS} in {self._where}: nothing was sent")
 
     def _until(self, found: Callable[[], Any], seconds: float) -> Any:
-        """Call ``found`` until its result is true; returns it. After ``seconds`` it returns the last result."""
+        """Call ``found`` until its result is true, at most for ``seconds``. Returns the last result."""
         end = self.clock() + seconds
         while not (result := found()) and self.clock() < end:
             self._wait()
@@ -178,9 +178,9 @@ class Commander:
 
 
 class Wire(Commander):
-    """The program's end: states come in, commands go out. Nothing is sent before ``send``."""
+    """The end of the policy's program: it receives states and sends commands, the first one in ``send``."""
 
-    _sent = "nothing was sent"  # at this point; for errors
+    _sent = "nothing was sent"  # so far, for errors
 
     def __init__(
         self,
@@ -190,7 +190,7 @@ class Wire(Commander):
         wait: Callable[[], None] = lambda: time.sleep(0.001),
         clock: Callable[[], float] = clock,
     ) -> None:
-        """``wait`` passes a moment while nothing comes.
+        """``wait`` is called while no message arrives.
 
         With a simulated robot in the same process, ``wait`` steps it, and ``clock`` is its clock.
         """
@@ -207,7 +207,7 @@ class Wire(Commander):
         self._robot, self._heard = 0, dict[int, float]()
 
     def receive(self) -> Received | None:
-        """The newest state since the last call, stamped with the time of this call: call often."""
+        """The newest state since the last call, with the time of this call as its stamp, so call it often."""
         for sample in _taken(self._states):
             if len(sample.body) == self._size:
                 now = self.clock()
@@ -221,10 +221,10 @@ class Wire(Commander):
         return bool(_taken(self._others))
 
     def another_robot(self) -> str:
-        """Why states may come from another robot than the prepared one; "" if they do not.
+        """Why states may come from another robot than the prepared one, or "".
 
-        It counts publishers, since the states of two robots may be equal. A new publisher within AGAIN [s] of the
-        prepared robot's last state is another robot. Later it may be the same robot, restarted.
+        It counts publishers, because the states of two robots may be equal. A new publisher within AGAIN [s] of the
+        prepared robot's last state is another robot. After that it may be the same robot, restarted.
         """
         others = self._publishers() - {self._robot}
         if not self._robot or not others:
@@ -238,9 +238,9 @@ class Wire(Commander):
         return {handle % 2**64 for handle in self._states.get_matched_publications()}
 
     def _one_robot(self, seconds: float) -> None:
-        """Refuse two robots. Raises RobotError.
+        """Raise RobotError if several robots publish states.
 
-        A killed program counts until its lease is over, so wait for that.
+        A killed program counts until its lease ends, so wait at most ``seconds`` for that.
         """
 
         def known() -> bool:
@@ -255,8 +255,8 @@ class Wire(Commander):
     def prepare(self, seconds: float = 5.0, listen: float = 0.5, lies_down: bool = False) -> Received:
         """Wait for the robot, switch off its motion service and listen for other commanders. Returns its state.
 
-        ``lies_down``: the robot lies down first, so that it does not fall when its own program lets go.
-        Raises RobotError with the reason; no command was sent then.
+        ``lies_down``: the robot first lies down, so that it does not fall when its own program releases the motors.
+        Raises RobotError with the reason, before any command is sent.
         """
         if not (state := self._until(self.receive, seconds)):
             raise RobotError(self._nobody(seconds))
@@ -279,7 +279,7 @@ class Wire(Commander):
         return f"{text}; is it on, is this the right network interface, and can it be pinged (192.168.123.161)?"
 
     def _release(self, lies_down: bool, tries: int = 8) -> None:
-        """Switch off the robot's own motion programs. Without such a service there are none."""
+        """Switch off the robot's own motion programs. A robot without the service has none."""
         if not self._until(self._requests.get_matched_subscriptions, 0.5):
             return
         name, moment = "", 0.2 if self._where.endswith(LOOPBACK) else 3.0  # [s] unitree_sdk2's examples wait 1 to 5 s
@@ -297,10 +297,10 @@ class Wire(Commander):
         )
 
     def _program(self) -> str:
-        """The program that controls the motors; "" if there is none."""
+        """The name of the program that controls the motors, or "". Raises RobotError."""
         try:
-            said = json.loads(answer := self._ask(CHECK_MODE) or "{}")
-            name = said.get("name", "") if isinstance(said, dict) else None
+            content = json.loads(answer := self._ask(CHECK_MODE) or "{}")
+            name = content.get("name", "") if isinstance(content, dict) else None
         except (ValueError, RecursionError):
             name = None
         if not isinstance(name, str):
@@ -310,24 +310,24 @@ class Wire(Commander):
         return printable(name)
 
     def _ask(self, call: int, tries: int = 5) -> str:
-        """Call the motion service and return its data.
+        """Call the motion service and return its data. Raises RobotError without an answer.
 
-        Repeat the call each second: the robot's answer is lost if it has not discovered this reader yet.
+        The call is repeated each second, because an answer is lost if the robot has not discovered this reader yet.
         """
-        asked: set[int] = set()
+        ids: set[int] = set()
         for _ in range(tries):
             request = _request(call)
-            asked.add(request.header.identity.id)
+            ids.add(request.header.identity.id)
             self._requests.write(request)
-            if found := self._until(
-                lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0
+            if answers := self._until(
+                lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in ids], 1.0
             ):
-                return found[0].data
+                return answers[0].data
         raise RobotError(f"the robot's motion service does not answer: {self._sent}; restart the robot")
 
 
 class RobotEnd:
-    """The wire's end of a simulated robot: states go out, commands and calls of the motion service come in."""
+    """The end of a simulated robot: it sends states and receives commands and calls of its services."""
 
     def __init__(self, package: str, interface: str, domain: int) -> None:
         self._participant = _joined_by(self, interface, domain)

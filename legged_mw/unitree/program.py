@@ -1,4 +1,4 @@
-"""The program of `--serve unitree`: a simulated robot on the wire, in real time, until the time is over or Ctrl-C."""
+"""The program of `--serve unitree`: a simulated robot on the wire, in real time, until the end time or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from legged_mw.unitree.handset import Handset
 from legged_mw.unitree.robots import machine_of
 from legged_mw.unitree.serve import STEP, ServedRecord, SimulatedUnitree
 
-BEHIND = 0.1  # [s] of delay beyond which the simulation drops the lost time
-PRIORITY = 10  # ours, of a real-time process: below a policy's
-UPRIGHT = 0.5  # cosine of the tilt at which a robot counts as lying
+BEHIND = 0.1  # [s] delay above which the simulation does not catch up
+PRIORITY = 10  # ours, of a real-time process: lower than a policy's
+UPRIGHT = 0.5  # cosine of the tilt from which a robot counts as fallen
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Served:
     latencies: list[float]  # [s] from a sent state to the first command that answers it
     place: tuple[float, float, float]  # [m] of the root at the end
     record: ServedRecord
-    faults: Sequence[Fault]  # those that began
+    faults: Sequence[Fault]  # faults that began
 
     def text(self) -> str:
         record = self.record
@@ -64,7 +64,7 @@ class Served:
 
 
 class Latency:
-    """Latencies from a sent state to the first command that answers it. A command names its state in ``reserve``."""
+    """Latencies from a sent state to its first command. A command has the tick of its state in ``reserve``."""
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
@@ -89,7 +89,7 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faul
     gc.freeze()
     gc.disable()
     began = start = time.monotonic()
-    steps = begun = said = 0
+    steps = begun = printed = 0
     try:
         while sim.time < seconds - 1e-9:
             sim.remote = handset.state(sim.time)
@@ -99,9 +99,9 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faul
                 begun += 1
             sim.step()
             latency.watch(sim)
-            for why in list(sim.record.why.values())[said:]:
+            for why in list(sim.record.why.values())[printed:]:
                 print(f"refused: {why}; more of its kind are counted", flush=True)
-            said = len(sim.record.why)
+            printed = len(sim.record.why)
             if sim.acted["kp"].any():
                 upright = min(upright, sim.upright)
             steps += 1
@@ -137,7 +137,7 @@ def serve(
     need_dds()
     from legged_mw.unitree.link import RobotEnd, default_domain
 
-    real_time(PRIORITY, heirs=True)  # a robot's own computer does nothing else, either
+    real_time(PRIORITY, heirs=True)  # as on a robot, whose computer runs nothing else
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)

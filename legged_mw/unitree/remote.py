@@ -12,7 +12,7 @@ _HEAD = b"\x55\x51"
 
 
 def decode(data: bytes) -> Remote | None:
-    """Buttons and sticks; None from 40 zeros: no remote is on."""
+    """Buttons and sticks; None for 40 zeros, when no remote is on."""
     if not any(data):
         return None
     _, bits, lx, rx, ry, _, ly = _PACKED.unpack(data)

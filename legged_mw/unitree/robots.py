@@ -37,12 +37,12 @@ class Machine:
     motors: dict[str, int]  # joint -> slot in LowCmd_ and LowState_ [unitree_sdk2's headers and examples]
     modes: dict[int, int] = field(default_factory=dict)  # slot -> motor mode, if not 1
     feet: tuple[str, ...] = ()  # order of foot_force
-    lies_down: bool = False  # true if the robot's own program can lay it down
+    lies_down: bool = False  # True if the robot's own program can lie down
     cells: int = 0  # battery cells in series [Unitree's data sheets]; 0: unknown
 
     @property
     def limits(self) -> dict[str, float]:
-        """This machine's safety limits: 3 V a cell, where lithium batteries count as empty."""
+        """This machine's safety limits: 3 V per cell, at which a lithium battery is empty."""
         return {"voltage": 3.0 * self.cells} if self.cells else {}
 
     @property
@@ -77,12 +77,12 @@ H1 = Machine(
     modes={i: 0x0A if i < 10 else 0x01 for i in range(20)},  # strong motors, then weak ones
 )
 MACHINES = {machine.name: machine for machine in (GO2, G1, H1)}
-_LACKS = {23: (13, 14, 20, 21, 27, 28)}  # slots without a motor in a G1 with so many joints [unitree_sdk2's example]
+_LACKS = {23: (13, 14, 20, 21, 27, 28)}  # number of joints of a G1 -> slots without a motor [unitree_sdk2's example]
 BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # mode_machine -> joints of a G1 [unitree_rl_lab]
 
 
 def machine_of(joints: Sequence[str]) -> Machine:
-    """The robot with these joints, in any order. Raises RobotError with both lists."""
+    """The robot with these joints, in any order. Raises RobotError that lists the joints."""
     for machine in MACHINES.values():
         if set(joints) == set(machine.motors):
             return machine
@@ -112,9 +112,9 @@ def known_motors(package: str) -> str:
 
 
 def check_slots(machine: Machine, answers: np.ndarray) -> None:
-    """Refuse a robot with answers (slots,) from motors that are missing here, e.g. an H1 with a Go2's contract.
+    """Raise RobotError for answers (slots,) of motors that the machine lacks, as of an H1 with a Go2's contract.
 
-    Fewer motors pass: some simulators set only a part of a motor's answer. Raises RobotError.
+    Fewer answers are allowed, because some simulators fill only a part of a motor's answer.
     """
     if machine.package == "unitree_go" and (
         more := sorted({*np.flatnonzero(answers).tolist()} - {*machine.motors.values()})
@@ -126,9 +126,9 @@ def check_slots(machine: Machine, answers: np.ndarray) -> None:
 
 
 def check_body(machine: Machine, mode_machine: int) -> None:
-    """Refuse a G1 with other motors than the contract's. Raises RobotError.
+    """Raise RobotError for a G1 whose motors are not the contract's.
 
-    A simulation without mode_machine sends 0, which passes.
+    A simulation without mode_machine sends 0, which is allowed.
     """
     if machine is G1 and mode_machine and BODIES.get(mode_machine) != len(machine.motors):
         count = BODIES.get(mode_machine)

@@ -1,7 +1,7 @@
-"""A simulated robot at the other end of the wire: MuJoCo at the motors' rate, behind Unitree's messages.
+"""A simulated robot at the other end of the wire: MuJoCo at the motors' rate, with Unitree's messages.
 
-Each step of 2 ms sends a state, takes the newest command and applies tau + kp (q - q_now) + kd (dq - dq_now).
-Without a watchdog the last command holds forever, as on a robot.
+Each step of 2 ms sends a state, reads the newest command and applies tau + kp (q - q_now) + kd (dq - dq_now).
+Without a watchdog the last command stays active forever, as on a robot.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
 _MACHINE = {"g1": 5}  # mode_machine of a simulated robot
 _TOUCH = 60  # foot_force of a foot on the ground, in the robot's own unit; ours
 _FULL = 4.1  # [V] of a full battery cell
-_MOST = 1e10  # limit of any command value; NaN fails it, too. Ours: above POSITION_STOP, and its square is finite
+_MOST = 1e10  # limit of command values, also against NaN. Ours: above POSITION_STOP, and its square is finite
 _PARTS = ("q", "dq", "tau", "kp", "kd")  # of a motor's command
 _FAULT = 0x1  # motorstate of a motor with a fault
 # [weights/m], [weights s/m], [s] ours: stiffness and damping of a soft rope, and the time to lower it
@@ -45,14 +45,14 @@ LIMP, DAMPED, DRIVEN = "limp", "damped", "driven"  # state of the motors: no tor
 
 @dataclass
 class ServedRecord:
-    """The record of a simulated robot, by its own clock."""
+    """Measurements of a simulated robot, by its own clock."""
 
     commands: int = 0
     # commands of another size, with a wrong checksum, head or mode_machine, or with values that are not finite
     refused: int = 0
-    # kind of refusal -> reason of the first one
+    # kind of rejection -> reason of the first one
     why: dict[str, str] = field(default_factory=dict)
-    watchdog: int = 0  # times that it damped by itself
+    watchdog: int = 0  # number of times that the watchdog damped
     # [s] start of each motor state
     changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))
     beyond: float = 0.0  # [rad] largest joint angle outside the range
@@ -61,16 +61,16 @@ class ServedRecord:
     asked: float = 0.0  # [share of the motor's torque] largest commanded
 
     def drive(self, time: float, acted: dict[str, Floats]) -> None:
-        """Record that the motors obey ``acted``, (D,) each, from ``time`` [s] on."""
+        """Record that the motors apply ``acted``, (D,) each, from ``time`` [s] on."""
         driven = acted["kp"].any() or acted["tau"].any()
         what = DRIVEN if driven else DAMPED if acted["kd"].all() else LIMP
         if what != self.changes[-1][1]:
             self.changes.append((time, what))
 
     def damped_after(self, time: float) -> float | None:
-        """[s] from ``time`` until the motors only damped, to the end.
+        """[s] from ``time`` to the start of damping that lasts to the end.
 
-        None if they do not damp at the end, or were not driven before ``time``.
+        None if the motors do not damp at the end, or were not driven before ``time``.
         """
         before = next((what for since, what in reversed(self.changes) if since < time), LIMP)
         since, what = self.changes[-1]
@@ -95,7 +95,7 @@ class SimulatedUnitree:
         """Load the export's robot, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
 
         ``lift``: [m] above its start, where it hangs freely.
-        ``watchdog``: [s] without a command until it damps by itself.
+        ``watchdog``: [s] without a command after which it damps.
         """
         self.machine: Machine = machine_of(contract.joints)
         self.contract, self.end, self.faults, self.record, self._watchdog = (
@@ -115,29 +115,29 @@ class SimulatedUnitree:
             WireMessage(LAYOUTS[self.machine.package, "LowState_"]),
         )
         self.reset()
-        # the body on the rope: of a G1 in the air its torso
+        # the body that hangs on the rope: the heaviest one with ``lift``, as a G1's torso
         self._hung = int(np.argmax(self.model.body_mass)) if lift else 1
         self._height, self._weight = float(self.data.xpos[self._hung, 2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
-        self._rope = 1.0 if self.hoist else 0.0  # share of the rope's force that is left
+        self._rope = 1.0 if self.hoist else 0.0  # current share of the rope's force
         self._fill()
 
     def reset(self, after: float = 0.0) -> None:
         """Put the robot into its first keyframe, limp, ``after`` [s] from now.
 
-        Messages on the way are dropped. Its clock and its record go on.
+        Delayed messages are dropped. Its clock and its record continue.
         """
         time = self.time + after
         self._in, self._out, self._last = Line(self._rng), Line(self._rng), -math.inf
         self.command: WireMessage | None = None  # the last accepted one
-        self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) command that the motors obey
+        self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) command that the motors apply
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         self.data.qpos[2] += self._lift
         self.data.time = time
         mujoco.mj_step1(self.model, self.data)
 
     def _make_motors(self) -> None:
-        """Replace the scene's servos by torque motors. Joint damping becomes the motors' own."""
+        """Replace the scene's servos by torque motors. Damping is part of the motor law, not of the joints."""
         model, joints = self.model, [self.model.joint(name).id for name in self.contract.joints]
         self._dofs, self._angles = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
         self._actuators = self._scene.actuators
@@ -198,7 +198,7 @@ class SimulatedUnitree:
         self.record.fastest = max(self.record.fastest, float(np.abs(self.joint_vel).max()))
 
     def _receive(self, body: bytes) -> None:
-        """Handle one message of the wire; it may be anything."""
+        """Handle one message of the wire, which may be invalid."""
         layout = LAYOUTS[self.machine.package, "LowCmd_"]
         if len(body) == layout.size:
             self._take(WireMessage(layout, body))
@@ -210,18 +210,18 @@ class SimulatedUnitree:
         self.record.why.setdefault(kind, why)
 
     def _take(self, command: WireMessage) -> None:
-        """Accept a valid command, refuse any other."""
+        """Accept a valid command, reject any other."""
         if self.machine.package == "unitree_go":
-            kind, said, wanted = (
+            kind, sent, wanted = (
                 "head and level_flag",
                 (*map(int, command["head"]), int(command["level_flag"])),
                 LOW_LEVEL,
             )
         else:
-            kind, said, wanted = "mode_machine", int(command["mode_machine"]), int(self._state["mode_machine"])
+            kind, sent, wanted = "mode_machine", int(command["mode_machine"]), int(self._state["mode_machine"])
         wrong = [name for name in _PARTS if not (np.abs(command[f"motor_cmd.{name}"]) < _MOST).all()]
-        if said != wanted:
-            self._refuse(kind, f"a command with {kind} {said}, not {wanted}")
+        if sent != wanted:
+            self._refuse(kind, f"a command with {kind} {sent}, not {wanted}")
         elif not command.intact():
             self._refuse("checksum", f"a command with checksum {command['crc']:#x}, not {command.checksum():#x}")
         elif wrong:
@@ -273,7 +273,7 @@ class SimulatedUnitree:
         self.model.actuator_biasprm[self._actuators, :3] = law
 
     def _pull(self) -> None:
-        """Pull the hoist's rope. It holds a body upright at its height, softly, and lowers it slowly."""
+        """Apply the force of the hoist's rope. It holds a body softly upright at its height, and lowers it slowly."""
         if not self.hoist:
             self._rope = max(0.0, self._rope - STEP / _LOWERING)
         data, rope, body, moves = self.data, self._rope * self._weight, self._hung, np.zeros(6)
@@ -287,7 +287,7 @@ class SimulatedUnitree:
         data.xfrc_applied[body, 3:] = rope * (upright * tilt - 0.1 * upright * turn)
 
     def _fill(self) -> None:
-        """Fill the state message of this moment."""
+        """Fill the state message with the current state."""
         state, data, faults = self._state, self.data, self.faults
         orientation, roll = np.zeros(4), math.radians(faults.imu_tilt) / 2
         before = {part: state[NAN[part]] for part in NAN} if faults.stuck else {}
@@ -335,7 +335,7 @@ class SimulatedUnitree:
         dead = self._in_slots([name in faults.dead_motors for name in self.contract.joints]).astype(int)
         if self.machine.package == "unitree_go":
             state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], voltage
-            state["motor_state.lost"] = state["motor_state.lost"] + dead  # no message reaches them
+            state["motor_state.lost"] = state["motor_state.lost"] + dead  # messages to dead motors are lost
             feet = zip(self.contract.feet, self._scene.contacts, strict=True)
             touch = {foot: (self.data.sensordata[where] > 0.0).any() for foot, where in feet}
             state["foot_force"] = [_TOUCH * touch.get(foot, False) for foot in self.machine.feet] or 0

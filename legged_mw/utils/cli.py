@@ -1,4 +1,4 @@
-"""What all programs share: flags, one-line errors, durations, seeds. Imports neither torch nor numpy at the top."""
+"""Functions for all programs: flags, one-line errors, durations, seeds. The module imports no torch and no numpy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FEWER_WORLDS = "; fewer worlds need less: try half with --num_envs"  # for progr
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse, but a mistake is one line and exit code 2; every program has --verbose."""
+    """argparse's parser with errors of one line and exit code 2, and with --verbose."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -35,7 +35,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse's, but the error about an unknown flag names the nearest one."""
+        """As argparse's method, but the error for an unknown flag names the nearest flag."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
             flags = [word.partition("=")[0] for word in unknown if word.startswith("-")]
@@ -50,7 +50,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def make_parser(description: str | None) -> Parser:
-    """A parser with the flags of both train and play, under legged_gym's names."""
+    """A parser with the common flags of train and play, with legged_gym's names."""
     parser = Parser(description=description, allow_abbrev=False)
     parser.add_argument("--task", metavar="NAME", help="a task in configs/, or the path of a config file")
     parser.add_argument("--num_envs", type=positive, metavar="N", help="worlds stepped together")
@@ -73,7 +73,7 @@ def make_parser(description: str | None) -> Parser:
 
 
 def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
-    """Apply --override, then --set, then flags of single fields: the more specific wins."""
+    """Apply --override, then --set, then flags of single fields. Later ones override earlier ones."""
     for file in args.override:
         task.update(load_yaml(file), where=f"--override {file}")
     for item in args.set:
@@ -93,8 +93,8 @@ def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
 
 
 def pick_device(name: str | None) -> str:
-    """The device called ``name``, or the best one if that is None. Raises ConfigError if it does not exist."""
-    import torch  # not at the top: legged_mw.deploy imports this file and runs without torch
+    """The device ``name``; None: the first GPU, or the CPU. Raises ConfigError if it does not exist."""
+    import torch  # here, because legged_mw.deploy imports this file and runs without torch
 
     if name is None:
         return "cuda:0" if torch.cuda.is_available() else "cpu"
@@ -127,7 +127,7 @@ def positive(text: str) -> int:
 
 
 def number(kind: Any) -> Callable[[str], Any]:
-    """A reader of numbers for argparse; ``kind`` is a type of utils/bounds.py, or int or float."""
+    """A function that parses a number for argparse. ``kind``: a type of utils/bounds.py, int or float."""
 
     def read(text: str) -> Any:
         try:
@@ -139,7 +139,7 @@ def number(kind: Any) -> Callable[[str], Any]:
 
 
 def duration(text: str) -> float:
-    """Seconds of "90", "90s", "5m" or "1.5h", for argparse; at most 1e9 s, about thirty years."""
+    """Parse "90", "90s", "5m" or "1.5h" to seconds, for argparse; less than 1e9 s."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", text)
     seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
     if not 0.0 < seconds < 1e9:
@@ -149,11 +149,11 @@ def duration(text: str) -> float:
 
 @contextmanager
 def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
-    """End the program with one line and exit code 2 after a mistake of the user, in a request or in their own code.
+    """A context that ends the program with one line and exit code 2 for an error in the user's request or code.
 
-    --verbose adds the traceback. If memory runs out, the line ends with the advice ``fewer``. Ctrl-C gives code 130
-    where the program does not handle it: a training saves and ends with code 3 (rl/training.py). Our own mistakes stay
-    tracebacks. If the console closes, as in ``| head``, the program goes on.
+    --verbose adds the traceback. If memory runs out, the line ends with the advice ``fewer``. Ctrl-C gives code 130 if
+    the program does not handle it; a training saves and ends with code 3 (rl/training.py). Errors of our own code stay
+    tracebacks. If the console closes, as in ``| head``, the program continues.
     """
     program = program or Path(sys.argv[0]).name
     try:
@@ -170,7 +170,7 @@ def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
     except Exception as error:
         first: BaseException = error
         while first.__context__ is not None:
-            first = first.__context__  # a lack of memory often shows as another error that follows
+            first = first.__context__  # too little memory is often the cause of another error
         if isinstance(error, RuntimeError | MemoryError) and (out_of_memory(first) or out_of_memory(error)):
             fail(program, f"out of memory ({(str(first) or 'memory').splitlines()[0]}){fewer}")
         if where := users_fault(error):
@@ -185,16 +185,16 @@ def _show_all() -> None:
 
 
 def fail(program: str, message: str) -> NoReturn:
-    """Print one line to standard error; exit with code 2."""
+    """Print one line to standard error and exit with code 2."""
     with suppress(OSError):  # it may be closed
         print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 
 def command(program: str, processes: int = 1) -> str:
-    """How the user starts ``train`` or ``play``: ``python train.py`` in a clone, else ``legged-mw train``.
+    """The command that starts ``train`` or ``play``: ``python train.py`` in a clone, else ``legged-mw train``.
 
-    ``processes`` of torchrun; on several nodes, which torchrun counts in ``GROUP_WORLD_SIZE``, N is the node's number.
+    ``processes``: of torchrun. On several nodes (``GROUP_WORLD_SIZE``) the user replaces N by the node's number.
     """
     installed = Path(sys.argv[0]).name.startswith("legged-mw")
     if processes > 1:
@@ -206,14 +206,14 @@ def command(program: str, processes: int = 1) -> str:
     return f"legged-mw {program}" if installed else f"python {program}.py"
 
 
-# ---- a console that may close, as in | head: later prints are lost, the program goes on -----------------------------
+# ---- a console that may close, as in | head: later prints are lost, the program continues ---------------------------
 
 
 _GONE = (errno.EPIPE, errno.EIO, errno.EBADF)  # a closed pipe, a terminal that hung up, a closed descriptor
 
 
 class SafeStream:
-    """A stream that drops what cannot be written."""
+    """A stream that ignores failed writes."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -235,7 +235,7 @@ class SafeStream:
             return
         except OSError as error:
             if error.errno in _GONE:
-                with suppress(OSError, ValueError):  # Python flushes its buffer at the end, too: send that nowhere
+                with suppress(OSError, ValueError):  # discard the buffer that Python flushes at exit
                     nowhere = os.open(os.devnull, os.O_WRONLY)
                     os.dup2(nowhere, self._stream.fileno())
                     os.close(nowhere)
@@ -243,7 +243,7 @@ class SafeStream:
 
 @contextmanager
 def patient_console() -> Iterator[None]:
-    """Inside, a print that fails is dropped."""
+    """A context in which failed prints are ignored."""
     out, err = SafeStream(sys.stdout), SafeStream(sys.stderr)
     with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
         try:

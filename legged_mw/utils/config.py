@@ -94,10 +94,10 @@ def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
     path = f"{_path(cls)}.{name}"
     if inherited is not None and not _is_section(inherited):
         raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
-    theirs = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]
+    inherited_sections = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]
     if name not in vars(cls):
-        return _joined(cls, name, theirs)
-    for dropped in theirs:
+        return _joined(cls, name, inherited_sections)
+    for dropped in inherited_sections:
         if not issubclass(section, dropped):
             extends = ", ".join(_path(base) for base in section.__bases__ if base is not object) or "no section"
             fields = f"{_path(dropped)} ({', '.join(_schema(dropped))})"
@@ -399,10 +399,10 @@ class Config:
 
     def diff(self, other: Config) -> list[tuple[str, Any, Any]]:
         """(dotted path, own value, value in `other`) of all fields that differ; None if a side does not have it."""
-        mine, theirs = dict(_leaves(self)), dict(_leaves(other))
-        both = mine.keys() & theirs.keys()
+        own, others = dict(_leaves(self)), dict(_leaves(other))
+        both = own.keys() & others.keys()
         return [
-            (path, mine.get(path), theirs.get(path))
-            for path in mine | theirs
-            if path not in both or mine[path] != theirs[path]
+            (path, own.get(path), others.get(path))
+            for path in own | others
+            if path not in both or own[path] != others[path]
         ]

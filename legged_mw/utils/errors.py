@@ -144,7 +144,7 @@ def brief(value: object, most: int = 200) -> str:
 
 
 def printable(text: str) -> str:
-    """``text`` with control characters as \\x1b, because names from files and the network must not control a terminal."""
+    """``text`` with control characters as \\x1b: names from files and the network must not control a terminal."""
     return "".join(
         each if each.isprintable() or each == "\n" or unicodedata.category(each) == "Zs" else ascii(each)[1:-1]
         for each in text

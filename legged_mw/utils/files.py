@@ -1,4 +1,4 @@
-"""Files and folders: those that a config names, those that a flag wants written, and those that strangers made."""
+"""Checks of files and folders: named in a config, written for a flag, or made by a stranger."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from weakref import WeakKeyDictionary
 from legged_mw import ROOT
 from legged_mw.utils.errors import UserError, shown
 
-STAGED = ".export.new"  # folder within an export: all files of a newer export, to be moved into place
-MOST_LETTERS = 100  # [bytes] of a folder's name: systems allow 255, and we add a time and a number
-MOST_UNPACKED = 1 << 30  # [bytes] of all arrays in an .npz: hours of a robot's motion
-_FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
+STAGED = ".export.new"  # folder in an export with the files of a newer export, before they are moved
+MOST_LETTERS = 100  # [bytes] of a folder name: systems allow 255, and a time and a number are added
+MOST_UNPACKED = 1 << 30  # [bytes] of all arrays in an .npz, enough for hours of motion
+_FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> its Python file
 
 
 def note_file(cls: type) -> type:
-    """Remember which file ``cls`` is written in, and return it. Later another module may have the same name."""
+    """Store the file of ``cls`` and return ``cls``. Later another module may have the same name."""
     if file := getattr(sys.modules.get(cls.__module__), "__file__", None):
         _FILES.setdefault(cls, Path(file).resolve())
     return cls
@@ -33,8 +33,9 @@ def note_file(cls: type) -> type:
 def find_file(cfg: Any, path: str, one: str = "") -> Path:
     """The file named by the config field ``path`` ("asset.file"), or ``one`` of those that it lists. Raises UserError.
 
-    A relative name in a class body is looked for beside the file of that class. A name from a flag or a run is looked
-    for in the current folder, beside the task, and beside the classes that it extends. The repository comes last.
+    A relative name in a class body is searched in the folder of that class's file. A name from a flag or a run is
+    searched in the current folder, the task's folder, and the folders of the classes that the task extends. The
+    repository is searched last.
     """
     section, _, name = path.rpartition(".")
     owner = getattr(cfg, section)
@@ -46,7 +47,7 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
         classes = [*type(owner).__mro__, *type(cfg).__mro__]
     folders += [_FILES[cls].parent for cls in classes if cls in _FILES]
     places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder.is_absolute()))
-    for file in (place / written for place in places):  # an absolute path stays itself
+    for file in (place / written for place in places):  # an absolute path does not change
         if file.is_file():
             return file
     if written.is_absolute():
@@ -85,7 +86,7 @@ def writable(name: str, flag: str, folder: bool = False, suffix: str = "") -> Pa
 
 
 def check_name(name: str, where: str) -> str:
-    """``name`` if it can be a folder's on any system and does not lead elsewhere. Raises UserError."""
+    """``name``, if it is a valid name of a folder on all systems and not a path. Raises UserError."""
     if why := wrong_name(name):
         wrong = f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}"
         raise UserError(f"{wrong}; write a plain name, e.g. go1_fast")
@@ -93,7 +94,7 @@ def check_name(name: str, where: str) -> str:
 
 
 def wrong_name(name: str) -> str:
-    """Why no folder can have this name, or ''."""
+    """Why this name is not valid for a folder, or ''."""
     if (size := len(name.encode(errors="replace"))) > MOST_LETTERS:
         return f"it has {size} bytes, more than {MOST_LETTERS}"
     if name.startswith(("-", "~")) or (name and not name.strip(". ")):
@@ -102,7 +103,7 @@ def wrong_name(name: str) -> str:
 
 
 def typed(path: str) -> Path:
-    """A path that a user typed, with ~ replaced; it need not exist. Raises UserError for one that no file can have."""
+    """A path that a user typed, with ~ replaced; it need not exist. Raises UserError for an invalid path."""
     try:
         found = Path(path).expanduser()
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
@@ -111,16 +112,17 @@ def typed(path: str) -> Path:
         OSError,
         ValueError,
         RuntimeError,
-    ) as error:  # too long, a link to itself; a null character; an unknown ~user
+    ) as error:  # too long or a link to itself; a null character; an unknown ~user
         why = getattr(error, "strerror", None) or error
         raise UserError(f"'{path[:200]}' is no path here: {why}") from None
     return found
 
 
 def check_folder(folder: Path) -> Path:
-    """A run or an export, perhaps a stranger's. Raises UserError unless it holds files, folders and inner links alone.
+    """Raise UserError if a run or an export has anything but files, folders and links inside of it.
 
-    A link out of it would let another file be read or overwritten; reading a pipe would never end.
+    It may come from a stranger. With a link to the outside, other files could be read or overwritten. Reading a pipe
+    would never end.
     """
     home = folder.resolve()
     for place, folders, files in os.walk(home):
@@ -137,16 +139,16 @@ def check_folder(folder: Path) -> Path:
 
 
 def finish_moving(folder: Path) -> None:
-    """Finish an interrupted export: move its staged files into place. An empty staged file deletes its target.
+    """Finish an interrupted export: move its staged files into ``folder``. An empty staged file deletes its target.
 
-    Several programs may do this at once. Raises UserError if the folder cannot be written to.
+    Several programs may call this at the same time. Raises UserError if the folder cannot be written.
     """
     staged = folder / STAGED
     try:
         if not staged.is_dir() or staged.is_symlink():
             return
         for file in sorted(staged.iterdir(), key=lambda file: (file.suffix == ".yaml", file.name)):
-            with suppress(FileNotFoundError):  # another program has just moved it
+            with suppress(FileNotFoundError):  # another program has moved it
                 if file.stat().st_size:
                     os.replace(file, folder / file.name)
                 else:
@@ -160,8 +162,8 @@ def finish_moving(folder: Path) -> None:
 
 
 def read_arrays(file: Path) -> dict[str, Any]:
-    """The arrays in the .npz ``file``. Runs no code from it. Raises ValueError if it is missing or damaged."""
-    import numpy as np  # not at the top: programs start without it
+    """The arrays in the .npz ``file``, without running code from it. Raises ValueError if it is missing or damaged."""
+    import numpy as np  # here, so that programs start without it
 
     try:
         with zipfile.ZipFile(file) if zipfile.is_zipfile(file) else nullcontext() as parts:
@@ -181,5 +183,5 @@ def digest(file: Path) -> str:
 
 
 def file_of(cls: type) -> Path | None:
-    """The file in which the config class ``cls`` is written, if it is known."""
+    """The Python file of the config class ``cls``, or None if unknown."""
     return _FILES.get(cls)

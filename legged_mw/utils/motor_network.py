@@ -92,8 +92,8 @@ def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
         linear.append((weight, _take(arrays, f"bias{len(linear)}", len(weight))))
         width = len(weight)
     if not linear or width != 1:
-        found = width if linear else "none: there is no weight0"
-        raise ValueError(f"the last layer must give one value, a joint's torque; it gives {found}")
+        outputs = width if linear else "none: there is no weight0"
+        raise ValueError(f"the last layer must give one value, a joint's torque; it gives {outputs}")
     scales = {name: float(_take({name: 1.0, **arrays}, name)) for name in _SCALES}
     return MotorNetwork(recurrent, linear, activation, frames, bool(arrays.get("in_turns", False)), **scales)
 

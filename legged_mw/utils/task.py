@@ -222,8 +222,8 @@ def _modules(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, .
         of_tasks = {id(module) for kept in (*_packages.values(), *_beside.values()) for module in kept.values()}
         others = {name: module for name, module in before.items() if id(module) not in of_tasks}
         theirs = {_top(name) for name in others}
-        found = PathFinder.find_spec("configs") if "configs" in names else None
-        if found and [*(found.submodule_search_locations or ())] != [str(place) for place in places]:
+        other_package = PathFinder.find_spec("configs") if "configs" in names else None
+        if other_package and [*(other_package.submodule_search_locations or ())] != [str(place) for place in places]:
             theirs.add("configs")
         sys.modules.update({name: module for name, module in mine.items() if _top(name) not in theirs} | others)
 

@@ -1,7 +1,7 @@
-"""YAML in and out: reads configs, contracts and scripts, those of strangers too; writes configs.
+"""Read and write YAML: configs, contracts and scripts, also from strangers.
 
-It reads plain data alone: mappings with names as keys, lists, text, numbers, true, false, null. Everything else in a
-file is one ConfigError with file and line.
+Only plain data is read: mappings with names as keys, lists, text, numbers, true, false, null. Anything else raises a
+ConfigError with file and line.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FLOAT = rf"[-+]?(\d[\d_]*\.\d*|\.\d+|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$|{_EXPON
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's, with whole numbers as YAML 1.2 has them (010 is ten, 1:30 is text), no dates, and limits."""
+    """PyYAML's loader with the integers of YAML 1.2 (010 is ten, 1:30 is text), without dates, with size limits."""
 
     yaml_constructors = {tag: make for tag, make in yaml.SafeLoader.yaml_constructors.items() if tag in {None, *_PLAIN}}
     yaml_implicit_resolvers = {
@@ -36,11 +36,11 @@ class _Loader(yaml.SafeLoader):
 
     def __init__(self, stream: str | bytes) -> None:
         self._depth, self._nodes = 0, 0.0
-        self._sizes: dict[int, float] = {}  # nodes in a node, aliases written out
+        self._sizes: dict[int, float] = {}  # id of a node -> number of nodes in it, with aliases expanded
         super().__init__(stream)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Count the values. An alias counts as many as it stands for: a few lines of aliases could fill the memory."""
+        """Compose a node and count its values. An alias counts all its values: a few aliases could fill the memory."""
         event, before = self.peek_event(), self._nodes
         self._depth += 1
         if self._depth > MOST_DEPTH:
@@ -65,7 +65,7 @@ class _Loader(yaml.SafeLoader):
         return int(text, 0 if "x" in text or "o" in text else 10)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that is no text, and one written twice: PyYAML would let the second win."""
+        """Raise for a key that is not text or is written twice, where PyYAML would use the second value."""
         seen = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if key.tag not in (f"{_TAG}str", f"{_TAG}merge"):
@@ -78,7 +78,7 @@ class _Loader(yaml.SafeLoader):
 
 class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
-        return True  # a list used twice is written twice: anchors are not for readers
+        return True  # write a list twice if it is used twice, because anchors are hard to read
 
 
 def _error(problem: str, mark: Any) -> yaml.MarkedYAMLError:
@@ -88,24 +88,24 @@ def _error(problem: str, mark: Any) -> yaml.MarkedYAMLError:
 for _name, _pattern in (("float", _FLOAT), ("int", _INT)):
     _Loader.add_implicit_resolver(f"{_TAG}{_name}", re.compile(_pattern), list("-+.0123456789"))
 _Loader.add_constructor(f"{_TAG}int", _Loader.construct_yaml_int)
-# Plain YAML 1.1 reads 1e-4 as text. The writer must know that we read a number, so that it quotes a run called `1e4`.
+# In YAML 1.1 1e-4 is text, for our loader a number. So the writer must quote the name of a run such as `1e4`.
 _Dumper.add_implicit_resolver(f"{_TAG}float", re.compile(_EXPONENT), list("-+.0123456789"))
 
 
 def parse_yaml(text: str | bytes, where: str) -> Any:
-    """The data in ``text``. Raises ConfigError, which begins with ``where`` and the line."""
+    """The data in ``text``. Raises ConfigError that starts with ``where`` and the line."""
     try:
         return _Loader(text).get_single_data()
     except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None) or str(error)
-    except Exception as error:  # a parser's or constructor's own, as for !!int x
+    except Exception as error:  # another error of a parser or constructor, as for !!int x
         mark, problem = None, in_short(error)
     line = f":{mark.line + 1}" if mark else ""
     raise ConfigError(f"{where}{line}: not valid YAML: {' '.join(problem.split())}")
 
 
 def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The mapping in a YAML file, its numbers read as people write them. Raises ConfigError."""
+    """The mapping in a YAML file, in which 1e-4 is a number. Raises ConfigError."""
     path = Path(path)
     try:
         with path.open("rb") as file:
@@ -122,7 +122,7 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def save_yaml(path: str | os.PathLike[str], mapping: Mapping[str, Any]) -> None:
-    """Write `mapping` whole or not at all: no reader meets half a file, not after a crash either."""
+    """Write `mapping` atomically: the file is never incomplete, even after a crash."""
     path = Path(path)
     text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
