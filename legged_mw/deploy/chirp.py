@@ -49,7 +49,7 @@ def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract,
     return replace(contract, period=robot.step, decimation=1), limits.but(counted, "--chirp")
 
 
-class Plan(NamedTuple):
+class ChirpPlan(NamedTuple):
     """What a chirp moves, and how far."""
 
     pose: Floats  # (D,) [rad] of which the sweeps are about
@@ -138,7 +138,7 @@ class Chirp(JointCheck):
 # ---- the plan
 
 
-def plan(contract: Contract, scene: DeployScene, limits: Limits) -> Plan:
+def plan(contract: Contract, scene: DeployScene, limits: Limits) -> ChirpPlan:
     """Sweeps within the contract's limits, in which no limb meets another one or the body."""
     data, inertia = mujoco.MjData(scene.model), np.zeros((scene.model.nv, scene.model.nv))
     mujoco.mj_resetDataKeyframe(scene.model, data, 0)
@@ -153,7 +153,7 @@ def plan(contract: Contract, scene: DeployScene, limits: Limits) -> Plan:
     touches = _touches(scene, contract.joints, limbs)
     pose = _clear_pose(pose, amplitude, low + amplitude / ROOM, high - amplitude / ROOM, touches)
     limb = [limbs[int(scene.model.joint(name).bodyid[0])] for name in contract.joints]
-    return Plan(pose, amplitude, highest, _slots(limb, pose, amplitude, touches))
+    return ChirpPlan(pose, amplitude, highest, _slots(limb, pose, amplitude, touches))
 
 
 def _limbs(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, int]:

@@ -468,12 +468,16 @@ class LeggedRobot(RobotTask):
             return self._sigma
         return self._sigma * (1.0 + self.sigma_growth * self.tiles.levels)
 
+    @tracking_sigma.setter
+    def tracking_sigma(self, sigma: Tensor | float) -> None:
+        self._sigma = sigma
+
     def _init_foot_rewards(self) -> None:
         """Allocate what the active terms need besides the state."""
         on, rewards = self._active_scales(), self.cfg.rewards
-        self._sigma: Tensor | float = rewards.tracking_sigma  # a tensor () if it changes
+        self.tracking_sigma = rewards.tracking_sigma
         if rewards.tracking_sigma_end > 0.0:
-            self._sigma = self.remember(torch.tensor(rewards.tracking_sigma, device=self.device))
+            self.tracking_sigma = self.remember(torch.tensor(rewards.tracking_sigma, device=self.device))
         # (N,) its growth a level, by each world's kind of ground
         self.sigma_growth = self.tiles.of_kinds(rewards.tracking_sigma_growth) if self.tiles else None
         if not {"feet_orientation", "feet_distance"} & on.keys():
