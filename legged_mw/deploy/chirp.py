@@ -1,7 +1,7 @@
 """The chirp: after the joint check the joints of a hanging robot follow sines of rising frequency, one of each limb at a time.
 
 Its log is what ``legged-mw fit`` reads: slot after slot, every measurement that the robot sends. The joints of a slot
-are of different limbs, which meet neither each other nor the body, and reach each other through the root alone.
+are of different limbs. Their shapes stay apart, and they move each other through the root alone.
 """
 
 from __future__ import annotations
