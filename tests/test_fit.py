@@ -163,7 +163,7 @@ def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("name", "slots"), [("go2_flat", 3), ("g1_flat", 7)])
-def test_limbs_that_sweep_together_are_apart(name: str, slots: int) -> None:
+def test_a_slot_has_one_joint_of_a_limb(name: str, slots: int) -> None:
     folder = POLICIES / name
     contract = read_contract(folder)
     plan = chirp.plan(contract, read_scene(folder, contract), Limits.of(folder, contract))

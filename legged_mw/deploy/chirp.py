@@ -139,7 +139,11 @@ class Chirp(JointCheck):
 
 
 def plan(contract: Contract, scene: DeployScene, limits: Limits) -> ChirpPlan:
-    """Sweeps within the contract's limits, in which no limb meets another one or the body."""
+    """Sweeps within the contract's limits.
+
+    Two joints of a slot bring no shapes of two limbs nearer than CLEAR. The root's shapes are not checked, and a joint
+    that meets another limb from every pose that was tried sweeps nevertheless, alone.
+    """
     data, inertia = mujoco.MjData(scene.model), np.zeros((scene.model.nv, scene.model.nv))
     mujoco.mj_resetDataKeyframe(scene.model, data, 0)
     mujoco.mj_forward(scene.model, data)
@@ -213,9 +217,8 @@ def _clear_pose(pose: Floats, amplitude: Floats, low: Floats, high: Floats, touc
     asides = sorted(ASIDE * np.arange(-FARTHEST, FARTHEST + 1), key=abs)
     for _ in range(PASSES):
         for joint in reversed(range(len(pose))):  # of a limb, those that carry less first
-            inside = [default[joint]] + [
-                angle for angle in default[joint] + asides if low[joint] <= angle <= high[joint]
-            ]
+            angles = [default[joint] + aside for aside in asides]
+            inside = [angle for i, angle in enumerate(angles) if not i or low[joint] <= angle <= high[joint]]
             met = list[int]()
             for pose[joint] in inside:
                 met.append(sum(map(touches, _ends(pose, amplitude, [joint]))))

@@ -77,7 +77,7 @@ class RobotTaskCfg(Config):
         # a sensor of the file by name; active reward terms add theirs
         sense: list[str] = []
         held_joints: list[str] = []  # names or patterns of joints that are welded at their default angle
-        # tables a joint that may omit joints, which keep the values of the file
+        # tables a joint; joints without a key keep the file's
         effort: dict[str, Positive] = {}  # largest torque of the servo, in both directions [N m]
         armature: dict[str, Gain] = {}  # inertia of the rotor at the joint [kg m^2]
         frictionloss: dict[str, Gain] = {}  # dry friction [N m]
