@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import subprocess
 import sys
-import time
-from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -681,105 +678,6 @@ def test_curves_are_of_the_last_seconds_and_the_panel_closes_what_it_opens() -> 
     with pytest.raises(RuntimeError):
         page.build()
     assert ui.depth == 0 and plot.depth == 0
-
-
-def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also if its server, a thread of its own, begins late. (One viewer a process: after a second one warp crashed.)"""
-    import asyncio
-    import urllib.request
-
-    from mujoco.studio import web_viewer
-    from mujoco.studio.web import web_server
-
-    from legged_mw.view.web import WebViewer
-
-    pilot, serve = Pilot(THREE, 2), web_server.serve
-
-    async def late(*args: Any, **settings: Any) -> Any:
-        await asyncio.sleep(0.3)
-        return await serve(*args, **settings)
-
-    monkeypatch.setattr(web_server, "serve", late)
-    with closing(WebViewer(SPEC, pilot, 2)) as page:
-        assert page._plugin.viewer._http_sock.getsockname()[0] == "127.0.0.1"
-        stage = FakeStage()
-        now = np.zeros((2, 3))
-        for _ in range(3):
-            page.show(Moment(0.0, stage.qpos(), now, now, now, np.ones((2, 4), dtype=bool)))
-        with urllib.request.urlopen(f"http://127.0.0.1:{page.port}/", timeout=60) as answer:
-            assert b"canvas" in answer.read()
-        with pytest.raises(OSError):  # any other address of this machine
-            urllib.request.urlopen(f"http://[::1]:{page.port}/", timeout=2)
-        with pytest.raises(ViewError, match=rf"--port {page.port} is in use on 127.0.0.1; leave it out"):
-            WebViewer(SPEC, pilot, port=page.port)
-    assert not page.is_running()
-    with pytest.raises(ViewError, match=r"--host 203.0.113.7: this machine has no such address"):
-        WebViewer(SPEC, pilot, host="203.0.113.7")
-    with pytest.raises(ViewError, match="--host"):  # which a socket takes for every interface
-        WebViewer(SPEC, pilot, host="")
-    assert not hasattr(web_viewer, "print"), "Studio's own words are its own again"
-
-
-# Studio's program as far as our script sees it, 3 frames a second: it has its model and drives
-SLOW = """currentModelCrc = 1; Module.session_id = "7"; new WebSocket(origin.replace("http", "ws") + "/ui?sid=7");
-(function frame() { const end = performance.now() + 300; while (performance.now() < end); requestAnimationFrame(frame); })()"""
-
-
-# the tab is hidden or shown; a stand-in for Studio's link shows what is asked there
-SEEN = """(hidden) => { Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
-session = { send: (word) => { document.title = word; } }; document.dispatchEvent(new Event("visibilitychange")); }"""
-ASK = """new WebSocket(origin.replace("http", "ws") + "/ui?sid=7")"""
-
-
-@pytest.mark.browser
-def test_a_slow_browser_gets_pictures_and_no_short_key_is_lost() -> None:
-    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
-
-    from legged_mw.view.web import WebViewer
-
-    def pressed(tab: Any) -> int:
-        for _ in range(3):
-            tab.keyboard.press("p")
-        pushes, until = 0, time.monotonic() + 20
-        while pushes < 3 and time.monotonic() < until:
-            tab.wait_for_timeout(100)
-            pilot.listen()
-            pushes += len(pilot.take_pushes())
-        return pushes
-
-    wrong, now = list[str](), np.zeros((1, 3))
-    moment = Moment(0.0, np.array([[0, 0, 1.0, 1, 0, 0, 0]]), now, now, now, np.ones((1, 0), dtype=bool))
-    with closing(WebViewer(SPEC, pilot := Pilot(THREE), 1)) as page, sync_playwright() as play:
-        page.show(moment)
-        browser = play.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-        tab = browser.new_page(viewport={"width": 390, "height": 800})
-        tab.on("pageerror", lambda error: wrong.append(str(error)))
-        tab.route("**/web_client.js", lambda route: route.fulfill(body=SLOW, content_type="text/javascript"))
-        tab.goto(f"{page.url}#browser")
-        tab.wait_for_function("shown.length > 3")
-        assert pressed(tab) == 3 and tab.url.endswith("#browser")  # as asked, however slow
-        tab.evaluate(SEEN, True)  # a hidden tab leaves, so that another page drives
-        other = browser.new_page()
-        other.goto(f"{page.url}drawn")
-        other.wait_for_function("facts?.drives")
-        tab.evaluate(SEEN, False)
-        tab.evaluate(ASK)
-        tab.wait_for_function("document.title === 'request_control'")  # refused, it joins the queue
-        other.close()
-        tab.goto(f"{page.url}?")
-        tab.wait_for_url("**/drawn#*")
-        tab.wait_for_function("facts?.drives && times.length > 1")
-        assert pressed(tab) == 3 and "drawn by the server" in tab.inner_text("#how")
-        assert tab.evaluate("document.documentElement.scrollWidth") == 390 and not tab.is_visible("#buttons")
-        tab.click("#title")
-        assert tab.is_visible("#buttons") and pilot.command[0] == 0.0
-        tab.locator("#sliders input").first.fill("0.5")
-        tab.get_by_text("Stop", exact=True).wait_for()
-        tab.wait_for_timeout(200)
-        pilot.listen()
-        assert pilot.driving and pilot.command.tolist() == [0.5, 0, 0]
-        browser.close()
-    assert wrong == []
 
 
 # ---- the environment as a stage

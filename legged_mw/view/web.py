@@ -44,9 +44,9 @@ def missing() -> str | None:
 
 
 class WebViewer:
-    """Serves the page at `url` until `close`. Only one at a time per process."""
+    """Serves the page at `url` until `close`. Once per process: after `close`, another one may crash in MuJoCo."""
 
-    _serving = ""  # the address of the open page
+    _opened = False  # by this process
 
     def __init__(
         self,
@@ -66,19 +66,19 @@ class WebViewer:
 
         self.robots = PosedRobots(spec, count)
         port = free_port(host, port)
-        # Studio's NetImgui client is a C++ global: a second client never finishes its first picture
-        if WebViewer._serving:
+        # Studio's NetImgui client is a C++ global: a second one hangs while the first lives, and can crash afterwards
+        if WebViewer._opened:
             raise ViewError(
-                f"--viewer web: this process serves {WebViewer._serving} already, and MuJoCo's web viewer can be there once: close it first"
+                "--viewer web: this process has opened a page, and MuJoCo's web viewer opens one in a process: start another process"
             )
         self._plugin, gate = StudioPlugin(self.robots, pilot, title), Gate(host, port)
         self._stream = Stream(self.robots, self._plugin.panel)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
         with _bound_to(host, gate, self._stream):
+            WebViewer._opened = True
             self._handle: Any = launch_web.launch(config, plugins=[self._plugin])
             self._wait(host, port)
         self.url, self.port = gate.url(host), port
-        WebViewer._serving = self.url.partition("?")[0]
         atexit.register(self.close)  # an open page at exit is a segmentation fault
 
     def show(self, moment: Moment) -> None:
@@ -94,16 +94,12 @@ class WebViewer:
         return bool(self._handle.is_running())
 
     def close(self) -> None:
-        """Stop serving. May be called twice. Afterwards this process may serve another page."""
+        """Stop serving. May be called twice."""
         atexit.unregister(self.close)
         try:
             self._handle.close()
         finally:
             self._stream.close()
-            viewer, self._plugin.viewer = self._plugin._viewer, None
-            if viewer is not None and not self._handle._is_alive_fn():
-                vars(viewer).pop("_headless_ui", None)  # the last reference: C++ frees its objects once per process
-                WebViewer._serving = ""
 
     def _wait(self, host: str, port: int) -> None:
         """Wait until the page is served. Refuse any interface other than `host`."""

@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import importlib
-import io
-import json
 import math
 import socket
 import time
-import urllib.error
-import urllib.request
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -29,9 +23,7 @@ from legged_mw.unitree.client import UnitreeRobot
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.serve import SimulatedUnitree
-from legged_mw.view.drive import PUSH_MAX, Pilot
-from legged_mw.view.stage import Moment, ViewError
-from legged_mw.view.web import MOST, Gate, WebViewer, is_local
+from legged_mw.view.web import Gate, is_local
 from tests.wires import POLICIES, Owner
 
 NAN, INF = math.nan, math.inf
@@ -141,118 +133,6 @@ def test_which_pages_have_a_token_and_what_is_opened() -> None:
     }
     assert gate.greeting(f"/drawn?token={gate.token}")["Location"] == "/drawn"
     assert not gate.greeting("/?token=abc") and not gate.greeting(f"/ui?token={gate.token}")
-
-
-SPEC = mujoco.MjSpec.from_string(  # pyright: ignore[reportAttributeAccessIssue]
-    "<mujoco><worldbody><geom type='plane' size='1 1 .1'/><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-)
-
-
-def answer(port: int, path: str = "/", **headers: str) -> tuple[int, str, Any]:
-    request = urllib.request.Request(
-        f"http://127.0.0.1:{port}{path}", headers={k.replace("_", "-"): v for k, v in headers.items()}
-    )
-    try:
-        with urllib.request.urlopen(request, timeout=10) as got:
-            return got.status, got.read().decode(), got.headers
-    except urllib.error.HTTPError as error:
-        return error.code, error.read().decode(), error.headers
-
-
-BAD_REQUESTS: list[str | bytes] = [
-    *("", "x", "[]", "null", "{}", '["press"]', '["press", 1]', '["click", "jump"]', '["steer", 0, 1]', '["steer", -1, 1]'),
-    *('["turn", NaN, 0]', '["zoom", 1e999]', '["push", -1e30]', '["push", "fast"]', f'["press", "{"x" * 300}"]', "[" * 150),
-    *(b"\xff", b"\x00" * 3000),
-]  # fmt: skip
-
-
-def watch(url: str, own: Any, pilot: Pilot) -> None:
-    """Pictures drawn by the server: of the right size, not black; the first page drives, and a bad request ends a page."""
-    from PIL import Image
-    from websockets.exceptions import ConnectionClosed
-    from websockets.sync.client import connect
-
-    def look(page: Any) -> tuple[dict[str, Any], bytes]:
-        page.send("next")
-        facts = json.loads(page.recv(timeout=60))
-        assert "error" not in facts
-        return facts, page.recv(timeout=60)
-
-    with connect(url + "/stream", origin=own) as late:
-        with connect(url + "/stream", origin=own) as driver:
-            (facts, picture), (watched, _) = look(driver), look(late)
-            assert facts["drives"] and not watched["drives"] and facts["buttons"] and facts["push"]
-            image = Image.open(io.BytesIO(picture))
-            assert (image.format, image.size) == ("JPEG", (640, 360)) and np.asarray(image).max() > 100
-            for page in (late, driver):
-                for request in ('["press", "p"]', '["turn", 0.4, 0.1]', '["zoom", -0.1]', '["push", 99]'):
-                    page.send(request)
-                turned = look(page)
-            pilot.listen()
-            assert len(pilot.take_pushes()) == 1 and pilot.push_speed == PUSH_MAX and turned[1] != picture
-            with connect(url + "/ui?sid=1", origin=own) as studio, pytest.raises(ConnectionClosed, match="4001"):
-                studio.recv(timeout=10)
-            for request in BAD_REQUESTS:
-                with connect(url + "/stream", origin=own) as page, pytest.raises(ConnectionClosed, match="1008"):
-                    page.send(request)
-                    page.recv(timeout=10)
-        until = time.monotonic() + 10
-        while not look(late)[0]["drives"]:
-            assert time.monotonic() < until
-
-
-def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> None:
-    from websockets.exceptions import ConnectionClosed, InvalidStatus
-    from websockets.sync.client import connect
-
-    for turn in range(2):
-        with closing(WebViewer(SPEC, pilot := Pilot([]), 1)) as page:
-            now = np.zeros((1, 3))
-            page.show(
-                Moment(0.0, np.array([[0, 0, 1, 1, 0, 0, 0.0]]), now[:, :0], now, now, np.ones((1, 0), dtype=bool))
-            )
-            with pytest.raises(
-                ViewError,
-                match=r"this process serves http://localhost:\d+/ already, .* can be there once: close it first",
-            ):
-                WebViewer(SPEC, Pilot([]), 1)
-            status, text, headers = answer(page.port)
-            assert status == 200 and 'href="/drawn"' in text
-            assert "let currentModelCrc = 0;" in text  # of Studio's own: our script waits for it
-            assert (headers["X-Frame-Options"], headers["Access-Control-Allow-Origin"]) == ("DENY", None)
-            if turn:
-                break  # the rest once
-            for refused in ({"Host": "evil.test"}, {"Origin": "http://evil.test"}, {"Sec_Fetch_Site": "cross-site"}):
-                status, text, headers = answer(page.port, "/model", **refused)
-                assert status == 403 and text.count("\n") == 1 and headers["Cache-Control"] == "no-store"
-            url, own = f"ws://127.0.0.1:{page.port}", f"http://127.0.0.1:{page.port}"
-            for path, origin in (
-                ("/ui", "http://evil.test"),
-                ("/stream", "http://evil.test"),
-                ("/stream", None),
-                ("/drop", own),
-            ):
-                with pytest.raises(InvalidStatus, match="403"):
-                    connect(url + path, origin=origin)  # pyright: ignore[reportArgumentType]
-            with connect(f"{url}/state?sid=1", origin=own) as state:  # pyright: ignore[reportArgumentType]
-                for message in (
-                    "max_spectators=99999999999999999999",
-                    "theme=\x1b[31m",
-                    b"",
-                    bytes(63),
-                    b"\xff" * 64,
-                    "x" * 1000,
-                ):
-                    state.send(message)
-                with suppress(ConnectionClosed):
-                    state.send(bytes(MOST + 1))
-                with pytest.raises(ConnectionClosed, match="1009"):
-                    while True:
-                        state.recv(timeout=10)
-            watch(url, own, pilot)
-            with socket.create_connection(("127.0.0.1", page.port)) as raw:
-                raw.sendall(b"\x00\xff" * 500 + b"\r\n\r\n")
-            assert answer(page.port)[0] == 200 and page.is_running()
 
 
 # ---- the example's UDP link
