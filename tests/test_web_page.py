@@ -115,7 +115,7 @@ def watch(url: str, own: Any, pilot: Pilot) -> None:
 def test_the_page_is_served_on_this_machine_alone_and_once_in_a_process(page: WebViewer, pilot: Pilot) -> None:
     from mujoco.studio import web_viewer
 
-    assert page._plugin.viewer._http_sock.getsockname()[0] == "127.0.0.1"
+    assert page._plugin.viewer._http_sock.getsockname()[0] == "127.0.0.1"  # pyright: ignore[reportAttributeAccessIssue]
     status, text, headers = answer(page.port)
     assert status == 200 and "canvas" in text and 'href="/drawn"' in text
     assert "let currentModelCrc = 0;" in text  # of Studio's own: our script waits for it

@@ -116,7 +116,9 @@ def table() -> Table:
             "web: none in this mujoco": lambda: patched(
                 lambda root: WebViewer(spec(), None), web, missing=lambda: "there is none"
             )(Path()),  # type: ignore[arg-type]
-            "web: another one": lambda: patched(lambda root: WebViewer(spec(), None), WebViewer, _opened=True)(Path()),  # type: ignore[arg-type]
+            "web: another one": lambda: patched(lambda root: WebViewer(spec(), Pilot((), 1)), WebViewer, _opened=True)(
+                Path()
+            ),
             "web: cannot be guarded": unguarded,
             "a command outside": lambda: launch.check_drive(
                 SimpleNamespace(commands=None, command="base_height=0.1"),  # type: ignore[arg-type]
