@@ -114,7 +114,7 @@ def table() -> Table:
             "web: all ports in use": lambda: bound(Full, 0),
             "web: no such address": lambda: free_port("203.0.113.7"),
             "web: none in this mujoco": lambda: patched(
-                lambda root: WebViewer(spec(), None), web, missing=lambda: "there is none"
+                lambda root: WebViewer(spec(), Pilot((), 1)), web, missing=lambda: "there is none"
             )(Path()),  # type: ignore[arg-type]
             "web: another one": lambda: patched(lambda root: WebViewer(spec(), Pilot((), 1)), WebViewer, _opened=True)(
                 Path()
