@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatch
+from functools import cache
 
 from configs.go1_handstand import Go1HandstandCfg
 from configs.robots.go2 import Go2
@@ -176,6 +177,7 @@ OF_A_CONFIG = r"\b(?:config\w*|section)\b"
 OF_A_TASK = r"\b(?:foot|feet|command\w*|reward\w*|policy|policies|observation\w*|episode\w*)\b"
 
 
+@cache
 def imports(source: str) -> set[str]:
     """Dotted names that a file imports, anywhere in it: also in functions and for type checkers only."""
     found = set()

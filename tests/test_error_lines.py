@@ -11,9 +11,9 @@ import pytest
 import torch
 from golden import table
 from golden.areas import AREAS
+from program import guarded_once
 
 from legged_mw.check import guard
-from legged_mw.utils.task import LoadedTask
 
 GOLDEN = Path(__file__).parent / "golden/errors.txt"
 
@@ -22,25 +22,13 @@ def stored(area: str) -> list[str]:
     return [line for line in GOLDEN.read_text().splitlines() if line.startswith(f"{area}/")]
 
 
-@pytest.fixture
-def guarded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that has passed the guard is not stepped again: its class and the tiny config are all that the guard sees.
-
-    The area own_code, which is about the guard, calls it itself.
-    """
-    check, passed = guard.check_recordable, dict[tuple[type, str], str]()
-
-    def once(task: LoadedTask) -> str:
-        key = task.env_class, repr(guard.tiny_cfg(task.cfg).to_dict())
-        if key not in passed:
-            passed[key] = check(task)
-        return passed[key]
-
-    monkeypatch.setattr(guard, "check_recordable", once)
-
-
 @pytest.mark.parametrize("area", AREAS)
-def test_every_line(area: str, made: Path, tmp_path: Path, request: pytest.FixtureRequest, guarded_once: None) -> None:
+def test_every_line(
+    area: str, made: Path, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        guard, "check_recordable", guarded_once
+    )  # the area own_code, which is about it, calls it itself
     table.made_run[:] = [made.parent]
     torch.manual_seed(0)
     found = sorted(table.lines(area, import_module(f"golden.{area}").table(), tmp_path))

@@ -206,20 +206,26 @@ def test_a_tensor_that_a_file_holds_is_named(tmp_path: Path) -> None:
 
 
 ORDINARY = {
-    "reads": (REWARD, "self.foot_height.index_select(1, self.rows).sum(dim=1) * self.foot"),
-    "own tensors": (REWARD, "(self.past + 1.0).mul_(2.0).masked_fill_(self.fell, 0.0)"),
-    "in place": (
-        END_STEP,
-        "self.past += 1.0; self.view = self.dof_pos[:, :3]; self.parts.kept['past'].copy_(self.past)",
+    "reads and own tensors": (
+        REWARD,
+        "self.foot_height.index_select(1, self.rows).sum(dim=1) * self.foot"
+        " + (self.past + 1.0).mul_(2.0).masked_fill_(self.fell, 0.0)",
     ),
-    "made in the first step": (END_STEP, "self.half = getattr(self, 'half', None) or [torch.tensor(0.5)]"),
-    "a number that stays": (END_STEP, "self.unknown = float('nan')"),
-    "on the device": (END_STEP, "self.past.add_(self.moved + self.net(self.past[:, None])[:, 0])"),
-    "in place by a training": (ANNEAL, "self.past.fill_(share); self.slots.one.copy_(self.past)"),
-    "random numbers between steps": (ANNEAL, "self.past.fill_(random.random() + RNG.normal())"),
-    "a number without a device": (INIT, "self.own = torch.tensor(0.5)"),
-    "a file's, moved by a call": (INIT, "self.own = torch.as_tensor(AT_IMPORT, device=self.device)"),
-    "fresh, moved by a call": (INIT, "self.own = torch.asarray(torch.tensor([1.0]), device=self.device)"),
+    "in place, made in the first step, a number that stays, on the device": (
+        END_STEP,
+        "self.past += 1.0; self.view = self.dof_pos[:, :3]; self.parts.kept['past'].copy_(self.past);"
+        " self.half = getattr(self, 'half', None) or [torch.tensor(0.5)]; self.unknown = float('nan');"
+        " self.past.add_(self.moved + self.net(self.past[:, None])[:, 0])",
+    ),
+    "in place by a training, random numbers between steps": (
+        ANNEAL,
+        "self.past.fill_(share); self.slots.one.copy_(self.past); self.past.fill_(random.random() + RNG.normal())",
+    ),
+    "a number without a device, a file's and a fresh one moved by a call": (
+        INIT,
+        "self.own = torch.tensor(0.5); self.other = torch.as_tensor(AT_IMPORT, device=self.device);"
+        " self.third = torch.asarray(torch.tensor([1.0]), device=self.device)",
+    ),
     "row of a buffer": (TABLE, "Row('past', self.past[:, None])"),
 }
 

@@ -367,8 +367,10 @@ while True:
 """  # what a training is to a sweep
 
 
-@pytest.mark.parametrize("state", ["starts", "trains"])
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL"])
+@pytest.mark.parametrize(
+    ("name", "state"),
+    [("SIGTERM", "starts"), ("SIGINT", "trains"), ("SIGTERM", "trains"), ("SIGHUP", "trains"), ("SIGKILL", "trains")],
+)
 def test_no_training_outlives_its_sweep(name: str, state: str, tmp_path: Path) -> None:
     """And no other begins; one that has not yet begun to train is not there to save.
 

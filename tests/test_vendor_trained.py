@@ -43,10 +43,13 @@ def test_they_are_six_short_files() -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "device"),
-    [("mujoco", "cpu"), ("mujoco_warp", "cpu"), pytest.param("mujoco_warp", "cuda:0", marks=pytest.mark.gpu)],
+    ("name", "engine", "device"),
+    [
+        *((name, "mujoco", "cpu") for name in TASKS),
+        ("t1_style", "mujoco_warp", "cpu"),
+        *(pytest.param(name, "mujoco_warp", "cuda:0", marks=pytest.mark.gpu) for name in TASKS),
+    ],
 )
-@pytest.mark.parametrize("name", TASKS)
 def test_from_the_file_to_a_deployed_policy(name: str, engine: str, device: str, robots: Path, tmp_path: Path) -> None:
     task = ["--task", str(robots / f"{name}.py"), "--device", device, "--engine", engine]
     checked = run("train", tmp_path, *task, "--check")

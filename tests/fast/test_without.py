@@ -13,7 +13,8 @@ import pytest
 from legged_mw import ROOT
 
 PARTS = ("legged_mw", "configs", "resources", "examples", "tests", "train.py", "pyproject.toml")
-TESTS = ("tests/test_net.py", "tests/test_env.py", "tests/test_ppo.py")
+# the step of two tasks by both engines, and updates against rsl-rl's: what legged_mw/fast computes in another way
+TESTS = ("tests/test_net.py", "tests/test_ppo.py", "-k", "first_steps and (go1_flat or g1_track) or rate or symmetric")
 TRAINING = [
     *("train.py", "--task", "go1_flat", "--num_envs", "16", "--device", "cpu", "--max_iterations", "3"),
     *("--set", "runner.export=false"),
@@ -50,9 +51,8 @@ def test_other_tests_pass_without(copy: Path) -> None:
     assert "passed" in said and "failed" not in said
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
-def test_a_training_runs_without(engine: str, copy: Path) -> None:
-    assert "done: " in python(copy, *TRAINING, "--set", f"sim.engine={engine}")
+def test_a_training_runs_without(copy: Path) -> None:
+    assert "done: " in python(copy, *TRAINING, "--set", "sim.engine=mujoco_warp")
 
 
 def test_only_a_missing_package_is_accepted(copy: Path) -> None:
