@@ -1,7 +1,7 @@
 """Find every tensor that an environment holds, by a walk over its objects: all that a step may write.
 
-The guard finds by it the values that a resumed run would lack, the step compiler the values to compare. An exact resume
-itself reads a list, ``BaseTask.remembered``.
+The guard uses it to find values that a resumed run would lack. The step compiler uses it to compare values. An exact
+resume does not search: it reads the list ``BaseTask.remembered``.
 """
 
 from __future__ import annotations
