@@ -88,7 +88,7 @@ class Exported(NamedTuple):
 
 
 def export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> Exported:
-    """Write the policy in ``checkpoint`` to ``folder``: all files, or none. ``trained``: the task with the trained config.
+    """Write the policy in ``checkpoint`` to ``folder``: all files, or none. ``trained``: the task with that config.
 
     ``half``: round the weights to float16 and store them so. The comparison uses these weights. Raises ExportError,
     ContractError, ConfigError or ModelError. Then an earlier export in the folder is not changed.

@@ -53,7 +53,7 @@ def main() -> None:
         show_task(load_task(args.file, say=True), image)
         return
     if args.new:
-        # refuse before the page, not after it
+        # raise before the page is printed
         new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
     found = draft(file, args.sim)
     if args.new:

@@ -1,10 +1,10 @@
-"""An actuator network in torchscript (legged_gym, walk-these-ways, Isaac Lab) as the .npz that `control.network` takes.
+"""Convert an actuator network in torchscript (legged_gym, walk-these-ways, Isaac Lab) to an .npz for `control.network`.
 
     python -m legged_mw.robot.actuator_net anydrive_v3_lstm.pt anydrive.npz
 
-Loading a torchscript file runs what is in it: convert files that you trust, once. Loading the .npz runs nothing. The weights are taken
-by their shapes. What the file computes and what the .npz computes is compared before anything is written: activation and scales are
-those for which they agree.
+Loading a torchscript file runs its code, so convert only files that you trust. Loading the .npz runs no code. The
+shapes of the weights give the layers. Activation and scales are those for which the outputs of both files agree.
+Nothing is written if they differ.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Missing or unreadable meshes and textures: drop those of visuals, raise an error for those of the physics."""
+"""Handle missing or unreadable meshes and textures: drop those of visuals, raise an error for those of the physics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from legged_mw.sim.robot_file import compile_copy
 from legged_mw.utils.errors import ModelError
 
 READABLE = (".stl", ".obj", ".msh", ".dae")  # mesh formats of MuJoCo's reader, and ours
-FACES_OF_LOOKS, _FACES_OF_COLLIDERS = 5_000, 100_000  # more are thinned [ours: a link on a screen]
+FACES_OF_LOOKS, _FACES_OF_COLLIDERS = 5_000, 100_000  # larger meshes are thinned [ours: a link on a screen]
 INSTEAD = 'give the geom a primitive shape, or let it not collide (contype="0" conaffinity="0")'
 
 
@@ -105,7 +105,7 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
 
 
 def matters(geom: mujoco.MjsGeom) -> bool:
-    """Whether a geom is more than looks: it collides, or gives its body mass."""
+    """Whether a geom affects the physics: it collides, or gives its body mass."""
     return bool(geom.contype or geom.conaffinity) or _gives_mass(geom)
 
 

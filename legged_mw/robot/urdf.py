@@ -1,4 +1,4 @@
-"""Prepare a URDF for MuJoCo's reader: find mesh files, drop unreadable visuals, keep links without mass massless."""
+"""Prepare a URDF for MuJoCo's reader: find mesh files, drop unreadable visuals, remove tiny masses."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def read_urdf(source: XmlSource, notes: list[str], lost: dict[str, str]) -> tupl
 
 
 def _drop_places(robot: Element, notes: list[str]) -> None:
-    """Drop root links that only place the robot for other programs, one after another."""
+    """Drop root links, such as base_footprint, that only define a frame for other programs."""
     children = {_end(joint, "child") for joint in robot.findall("joint")}
     for link in [link for link in robot.findall("link") if link.get("name") not in children]:
         held = [joint for joint in robot.findall("joint") if _end(joint, "parent") == link.get("name")]
@@ -71,7 +71,7 @@ def _end(joint: Element, which: str) -> str | None:
 
 
 def _leads_elsewhere(joint: Element) -> bool:
-    """Whether the joint moves the robot away from an empty link above it, such as base_footprint on the ground."""
+    """Whether the joint offsets or frees the robot from an empty parent link, such as base_footprint."""
     origin = joint.find("origin")
     numbers = [] if origin is None else f"{origin.get('xyz', '')} {origin.get('rpy', '')}".split()
     return joint.get("type") == "floating" or (
@@ -95,7 +95,7 @@ def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
 
 
 def _keep_one_material(robot: Element, notes: list[str]) -> None:
-    """Keep the first material of each look: MuJoCo refuses a second one, which B2's exporter writes."""
+    """Keep the first material of each visual: MuJoCo refuses a second one, which B2's exporter writes."""
     with_more = [part for part in robot.iter("visual") if len(part.findall("material")) > 1]
     for part in with_more:
         for other in part.findall("material")[1:]:
@@ -105,7 +105,7 @@ def _keep_one_material(robot: Element, notes: list[str]) -> None:
 
 
 def _drop_specks(robot: Element, notes: list[str]) -> None:
-    """Drop masses that an exporter writes for a link of no size, 4e-15 kg in B2's: MuJoCo takes no moment below 1e-15."""
+    """Drop masses of empty links, such as B2's exporter writes (4e-15 kg): MuJoCo refuses moments below 1e-15."""
     specks: list[str] = []
     for link in robot.findall("link"):
         inertial, mass = link.find("inertial"), link.find("inertial/mass")
@@ -159,7 +159,7 @@ def _find_meshes(robot: Element, file: Path, notes: list[str], lost: dict[str, s
 
 
 def _resolve(asked: str, file: Path, meshdir: str) -> Path:
-    """The path of a mesh in a URDF. package:// is the folder of that name above the URDF, else any folder above it."""
+    """The path of a mesh in a URDF. package:// is searched in the folders above it, by the package's name first."""
     here = file.resolve().parent
     scheme, _, rest = asked.rpartition("://")
     if scheme == "file":
@@ -170,13 +170,13 @@ def _resolve(asked: str, file: Path, meshdir: str) -> Path:
     places = [folder / inside for folder in above if folder.name == package] + [
         folder / package / inside for folder in above
     ]
-    # the package may lie in a folder of another name
+    # the folder of the package may have another name
     places += [folder / inside for folder in above[:5]] + [here / meshdir / inside, here / name, here / "meshes" / name]
     return next((place for place in places if place.is_file()), here / inside)
 
 
 def _set_looks(spec: mujoco.MjSpec) -> None:
-    """Hide colliders of links with visuals. Give links without <inertial> no mass."""
+    """Hide colliders of links with visuals. Links without <inertial> get no mass."""
     for body in spec.bodies:
         seen = any(not (geom.contype or geom.conaffinity) for geom in body.geoms)
         for geom in body.geoms:

@@ -14,7 +14,7 @@ from legged_mw.utils.errors import unknown
 
 FileNames = list[Annotated[str, Bound("the name of a file", bool)]]
 NonNegativeVector = Annotated[list[NonNegative], THREE]
-_BEGINNINGS = {  # fields of init_state that are not read, as episodes begin in a clip -> fields of motion instead
+_BEGINNINGS = {  # fields of init_state that have no effect, as episodes begin in a clip -> fields of motion instead
     "pos_xy_range": "start_pos",
     "yaw_range": "start_turn",
     "lin_vel_range": "start_lin_vel",
@@ -24,7 +24,7 @@ _BEGINNINGS = {  # fields of init_state that are not read, as episodes begin in 
 
 
 class MotionTrackingCfg(RobotTaskCfg):
-    """Following reference clips."""
+    """Motion tracking of reference clips."""
 
     class env(RobotTaskCfg.env):
         episode_length_s = 10.0
