@@ -1,4 +1,4 @@
-"""Safety limits between a policy and a robot. They are checked every step. An exceeded limit gives a `Trip`.
+"""Safety limits between a policy and a robot, checked in every step. An exceeded limit gives a `Trip`.
 
 The caller of `Safety` damps the robot. This module moves no joint, reads no clock and depends on no type of robot.
 """

@@ -120,7 +120,7 @@ class Region:
             step() if isinstance(step, Kernel) else _replay(step)
 
     def verify(self, device: str) -> bool:
-        """Run original and fused kernels from the same state. Returns whether they agree; if not, keeps the original."""
+        """Run original and fused kernels from the same state. Returns whether they agree; else keeps the original."""
         before, random = [value.clone() for value in self._written], _generator(device).get_state()
         for node in self.nodes:
             _replay(node)

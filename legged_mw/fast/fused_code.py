@@ -329,7 +329,7 @@ class Writer(Lines):
         return self._join(tensors, dim, stacked=True)
 
     def _picked(self, x: Tensor, place: Sequence[str]) -> str:
-        """An element of ``x`` at indices known at run time. In a tensor of worlds only the world's own row is allowed."""
+        """An element of ``x`` at indices of run time. In a tensor of worlds only the world's own row is allowed."""
         view = self._view(x)
         own = bool(place) and place[0] == WORLD and x.shape[0] == self._worlds
         access = self._access(view, view.shape) if own else Access(view, 0, view.offset, view.offset + span_of(view))

@@ -25,7 +25,7 @@ class Faults:
     jitter_ms: float = 0.0  # [ms] standard deviation of the delay
     loss: float = 0.0  # share of lost messages
     bad_crc: bool = False  # states with a wrong checksum
-    frozen: bool = False  # the same state is sent again and again
+    frozen: bool = False  # the same state is sent repeatedly
     # frozen parts of the state, by their names in NAN, and joints with frozen encoders
     stuck: set[str] = field(default_factory=set)
     silent: bool = False  # no states are sent

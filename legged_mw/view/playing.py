@@ -1,6 +1,6 @@
-"""Watching the training environment: the flags of play, the config as it is played, the environment as a stage.
+"""Watch the training environment: the flags of play, the config for playing, and the environment as a stage.
 
-Also the viewer of a policy that is still being trained. Only this file of `view/` imports torch and the environment.
+Also the viewer of a policy in training. In `view/` only this file imports torch and the environment.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.stage import BoolArray, FloatArray
 
-if TYPE_CHECKING:  # it imports git, a tenth of a second that play does not need
+if TYPE_CHECKING:  # it imports git, which takes 0.1 s and is not needed here
     from legged_mw.rl.runner import Runner
 
 NOMINAL = {  # overrides of the trained config for playing
@@ -118,7 +118,7 @@ def parse(description: str | None) -> argparse.Namespace:
 
 
 def check_together(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Refuse flags that mean nothing together."""
+    """Refuse flags that have no meaning together."""
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
@@ -301,7 +301,7 @@ class EnvStage:
 
 
 def _columns_of(env: RobotTask, wanted: str) -> list[tuple[str, slice, Tensor]]:
-    """The places of a row's newest values in the observations, also in nested groups: (group, columns, scales)."""
+    """The columns of a row's newest values in the observations, also in nested groups: (group, columns, scales)."""
     found: list[tuple[str, slice, Tensor]] = []
     for group, rows in env.observations.groups.items():
         for row in rows:
@@ -321,9 +321,9 @@ def _array(tensor: Tensor) -> FloatArray:
     return tensor.cpu().numpy().astype(np.float64)
 
 
-# ---- a policy that is still being trained: train --play writes it, play --follow reads it again
+# ---- a policy in training: train --play writes it, play --follow reads it again
 
-PLAYING = "playing.pt"  # the actor that train --play writes into its run for the viewer, more often than checkpoints
+PLAYING = "playing.pt"  # the actor that train --play writes for the viewer, more often than checkpoints
 _CHECK_SECONDS = 2.0  # between two checks of the folder
 _SAVE_SECONDS = 15.0  # between two saves of the policy for the viewer
 

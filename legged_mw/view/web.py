@@ -165,7 +165,7 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
             html = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(PAGE))}
             return Response(200, "OK", Headers({**html, "Cache-Control": "no-store"}), PAGE)
         if not reason and path == "/stream":
-            return None  # go on with the handshake
+            return None  # continue with the handshake
         if not reason:
             response = answer(connection, request)
             whole = path in ("/", "/index.html") and response.status_code == 200
