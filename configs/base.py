@@ -1,6 +1,6 @@
-"""Presets that tasks of different robots share: walking, getting up, standing on two of four legs, following a motion.
+"""Presets for tasks of different robots: walking, getting up, standing on two of four legs, tracking a motion.
 
-They are meant for a real robot. A robot's own names and numbers are in configs/robots/.
+They are for use on real robots. A robot's names and numbers are in configs/robots/.
 
 Sources: [I] Isaac Lab's G1, [M] mjlab's velocity task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks,
 [U] unitree_rl_gym's G1, [H] HoST, a G1 with 23 joints, [B] BeyondMimic; [ours] is measured: docs/lab.md.
@@ -16,7 +16,7 @@ from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 
 
 class SimToRealCfg(LeggedRobotCfg):
-    """A robot that walks by command and does not know its velocity."""
+    """A robot that walks by command, without a measured velocity."""
 
     class env(LeggedRobotCfg.env):
         num_envs = 8192
@@ -55,7 +55,7 @@ class SimToRealCfg(LeggedRobotCfg):
 
 
 class SimToRealCfgPPO(LeggedRobotCfgPPO):
-    """The learner of SimToRealCfg."""
+    """The learner's config for SimToRealCfg."""
 
     class runner(LeggedRobotCfgPPO.runner):
         num_steps_per_env = 12  # [ours]
@@ -79,7 +79,7 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
 
 class SimToRealRoughCfg(SimToRealCfg):
-    """A quadruped of a Go2's size on rough ground that it does not see. [L] legged_gym; [ours] docs/terrain.md."""
+    """A quadruped of a Go2's size on rough ground, without a height scan. [L] legged_gym; [ours] docs/terrain.md."""
 
     class commands(SimToRealCfg.commands):
         curriculum = False  # [ours: the ground's is enough]
@@ -109,7 +109,7 @@ class SimToRealRoughCfg(SimToRealCfg):
 
 
 class SimToRealRoughCfgPPO(SimToRealCfgPPO):
-    """Its learner on rough ground: longer rollouts and a longer horizon."""
+    """The learner's config on rough ground: longer rollouts and a longer horizon."""
 
     class runner(SimToRealCfgPPO.runner):
         num_steps_per_env = 24  # [legged_gym]
@@ -121,7 +121,7 @@ class SimToRealRoughCfgPPO(SimToRealCfgPPO):
 
 
 class BipedCfg(SimToRealCfg):
-    """A biped that walks by command and does not know its velocity."""
+    """A biped that walks by command, without a measured velocity."""
 
     class gait(SimToRealCfg.gait):
         period = 0.8  # [s] [U]
@@ -165,7 +165,7 @@ class BipedCfg(SimToRealCfg):
 
 
 class BipedCfgPPO(SimToRealCfgPPO):
-    """Its learner."""
+    """The learner's config of a biped."""
 
     class runner(SimToRealCfgPPO.runner):
         num_steps_per_env, max_iterations = 16, 3000  # [ours]
@@ -175,7 +175,7 @@ class BipedCfgPPO(SimToRealCfgPPO):
 
 
 class UprightBipedCfg(BipedCfg):
-    """A biped that walks upright: penalties count in full, and tracking outweighs them.
+    """A biped that walks upright: penalties are not clipped, and tracking has a larger weight.
 
     Numbers without a source: [ours: docs/archive/go2_and_g1.md, drafts on two feet].
     """
@@ -212,14 +212,14 @@ class UprightBipedCfg(BipedCfg):
 
 
 class UprightBipedCfgPPO(BipedCfgPPO):
-    """Its learner."""
+    """The learner's config of an upright biped."""
 
     class anneal(BipedCfgPPO.anneal):
         desired_kl = 0.0  # [ours: not annealed; if it shrinks, the learning rate falls to 1e-5]
 
 
 class BipedRoughCfg(BipedCfg):
-    """A biped of a G1's size on rough ground that it does not see."""
+    """A biped of a G1's size on rough ground, without a height scan."""
 
     class terrain(BipedCfg.terrain):
         mesh_type = "heightfield"
@@ -237,7 +237,7 @@ class BipedRoughCfg(BipedCfg):
 
 
 class BipedRoughCfgPPO(BipedCfgPPO):
-    """Its learner on rough ground."""
+    """The learner's config of a biped on rough ground."""
 
     class runner(BipedCfgPPO.runner):
         num_steps_per_env, max_iterations = 24, 1320  # [legged_gym], [ours: 420 s of a G1 on an H200]
@@ -273,7 +273,7 @@ class BipedGetupCfg(GetupCfg):
 
 
 class BipedGetupCfgPPO(GetupCfgPPO):
-    """Its learner."""
+    """The learner's config of a biped that gets up."""
 
     class runner(GetupCfgPPO.runner):
         max_iterations = 4000
@@ -284,7 +284,7 @@ class BipedGetupCfgPPO(GetupCfgPPO):
 
 
 class UnitreeHandstandCfg(HandstandCfg):
-    """A handstand of a quadruped with legs FR, FL, RR, RL: it stands on the front ones."""
+    """A handstand of a quadruped with legs FR, FL, RR, RL, on the front legs."""
 
     class asset(HandstandCfg.asset):
         penalize_contacts_on = ["RR*", "RL*"]
@@ -297,9 +297,10 @@ class UnitreeHandstandCfg(HandstandCfg):
 
 
 class UnitreeFootstandCfg(HandstandCfg):
-    """A footstand of such a quadruped: it stands on the rear legs.
+    """A footstand of such a quadruped, on the rear legs.
 
-    In [P] contacts of the front legs end an episode; here, as in a handstand, those of the standing legs (but feet).
+    In [P] a contact of the front legs ends an episode. Here, as in a handstand, those of the standing legs do, except
+    of the feet.
     """
 
     class asset(HandstandCfg.asset):
@@ -313,7 +314,7 @@ class UnitreeFootstandCfg(HandstandCfg):
 
 
 class TrackingCfg(MotionTrackingCfg):
-    """Following a motion without knowing one's place or velocity, in randomized worlds."""
+    """Tracking a motion without measured position and velocity, in randomized worlds."""
 
     class env(MotionTrackingCfg.env):
         num_envs = 8192
@@ -336,7 +337,7 @@ class TrackingCfg(MotionTrackingCfg):
 
 
 class TrackingCfgPPO(RobotTaskCfgPPO):
-    """The learner of one clip, of a humanoid."""
+    """The learner's config for one clip of a humanoid."""
 
     class algorithm(RobotTaskCfgPPO.algorithm):
         desired_kl = 0.02  # [ours: over 29 joints, as a walking G1's]
