@@ -227,7 +227,7 @@ class UdpServer:
                 if packet.kind == HELLO or self._move(packet, client):
                     heard = time.monotonic() if packet.kind == TARGETS else heard
                     self._send(self._measured(), client)
-        return f"{client[0]}:{client[1]} fell silent for {self._timeout:g} s"
+        return f"{client[0]}:{client[1]} sent nothing for {self._timeout:g} s"
 
     def _move(self, packet: Packet, client: tuple[str, int]) -> bool:
         """Whether these targets are new and were written."""

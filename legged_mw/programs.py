@@ -128,7 +128,7 @@ def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
 
     task = graded.task
     if active(task.cfg):
-        print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")
+        print("not graded through an export: an export has the nominal robot, and domain_rand changes it")
         return []
     with TemporaryDirectory() as folder:
         try:

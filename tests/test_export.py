@@ -162,7 +162,7 @@ def test_the_export_is_replaced_whole_or_not_at_all(
                 export(*arguments(made), out)
         assert files(tmp_path) == before
         if name == "run_onnx":
-            assert "policy.onnx acts otherwise than the trained policy: up to " in str(
+            assert "policy.onnx acts differently from the trained policy: up to " in str(
                 error.value
             ) and "nothing was written" in str(error.value)
     (out / "policy.yaml").write_text("stale")
@@ -589,7 +589,7 @@ def export_of(
 def test_an_export_that_would_act_otherwise_is_refused(
     env_class: type[LeggedRobot], what: str, method: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ExportError, match="legged_mw.deploy would act otherwise than the environment: ") as error:
+    with pytest.raises(ExportError, match="legged_mw.deploy would act differently from the environment: ") as error:
         export_of(env_class, made, tmp_path / "out", monkeypatch)
     assert what in str(error.value) and f"{method}. State it where the contract can take it from" in str(error.value)
     assert not list(tmp_path.iterdir())

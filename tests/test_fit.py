@@ -141,7 +141,7 @@ def kept(rows: Callable[[int], slice]) -> Callable[[DriveLog], DriveLog]:
         (changed("joint_pos", lambda q: own(q, q[0, JOINT])), "its encoder is dead"),
         (changed("joint_pos", lambda q: own(q, q[:, JOINT] + 0.3 * (np.arange(len(q)) > 900))), "encoder jumps by 0.3"),
         (changed("joint_pos", lambda q: own(q, -1.5 + 0.05 * (q[:, JOINT] + 1.5))), "its motor is loose"),
-        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint does"),
+        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint ends"),
         (kept(lambda count: slice(0, count, 10)), "has a measurement each 20 ms"),
         (changed("state", lambda state: 0.0 * state), "holds no chirp"),
         (changed("joint_pos", lambda q: q[:, :10]), "is of a robot with 10 joints"),

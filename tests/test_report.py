@@ -339,7 +339,10 @@ def test_compare_grades_each_by_its_own_config(
 @pytest.mark.parametrize(
     ("change", "line"),
     [
-        ({"task": "go1_flat_fast"}, "is of task 'go1_flat_fast', not 'go1_flat': two policies are graded on one task"),
+        (
+            {"task": "go1_flat_fast"},
+            "is of task 'go1_flat_fast', not 'go1_flat': both policies must have the same task",
+        ),
         (
             {"actor": {"hidden_dims": [9]}},
             "does not fit this task: actor mlp.0.weight is (8, 48) there and (9, 48) here",

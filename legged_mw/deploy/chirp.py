@@ -41,8 +41,8 @@ def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract,
     """
     if robot.step is None:
         raise RobotError(
-            f"--chirp needs measurements each few ms, and {type(robot).__name__} gives one a period: take --robot unitree, "
-            "on lo for one that --serve simulates"
+            f"--chirp needs a measurement every few ms, and {type(robot).__name__} gives one per period: use --robot unitree, "
+            "with --interface lo for a robot of --serve"
         )
     slower = contract.period / robot.step
     counted = {name: slower * getattr(limits, name) for name in ("age", "frozen", "late")}  # in steps

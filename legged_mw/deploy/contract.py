@@ -188,7 +188,7 @@ def target_range(model: mujoco.MjModel, actuators: Sequence[int]) -> tuple[np.nd
 def _range_of_scene(scene: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     if not scene.is_file():
         raise ContractError(
-            f"policy.yaml is of a format that leaves the range of the targets to {scene.name}, which is not beside it: put it there, "
+            f"policy.yaml has an old format without the range of the targets, and {scene.name}, which has it, is missing: put it there, "
             "or export the policy again"
         )
     model = compile_scene(scene)
@@ -672,7 +672,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
     part(folder, NETWORK_FILE)
     if digest(folder / NETWORK_FILE) != contract.digest:
         raise ContractError(
-            f"{NETWORK_FILE} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): "
+            f"{NETWORK_FILE} is not the exported file (its SHA-256 differs): "
             "it is damaged, or of another export; export the policy again"
         )
     if edited:
@@ -881,7 +881,7 @@ def _check_rows(contract: Contract) -> None:
             )
         if row.measured in REFERENCE and not contract.motion:
             raise ContractError(
-                f"{where} is of a motion, and the contract has no section `{MOTION}`; export the policy again"
+                f"{where} needs a motion, and the contract has no section `{MOTION}`; export the policy again"
             )
         if row.measured not in measurable:
             raise ContractError(

@@ -130,7 +130,7 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
         folder = Path(own) if recording.files else Path(recording.header["export"])
         contract = read_contract(folder)
         if contract.digest != recording.header["network"]:
-            raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)}")
+            raise LogError(f"{shown(path)} was recorded with another network than the one in {shown(folder)}")
         scene = read_scene(folder, contract)
     for part in leave_out:
         if not any(part in name for name in contract.joints):
@@ -150,11 +150,9 @@ def read_sweeps(
     on = recording.rows["state"][:, 0] == STATES.index(CHIRP)
     rows = {name: values[on].astype(float) for name, values in recording.rows.items()}
     if not on.any():
-        raise LogError(f"{shown(path)} holds no chirp: record one with legged-mw deploy EXPORT --robot unitree --chirp")
+        raise LogError(f"{shown(path)} has no chirp: record one with legged-mw deploy EXPORT --robot unitree --chirp")
     if (count := rows["joint_pos"].shape[1]) != len(contract.joints):
-        raise LogError(
-            f"{shown(path)} is of a robot with {count} joints, and its export of one with {len(contract.joints)}"
-        )
+        raise LogError(f"{shown(path)} has {count} joints, and its export has {len(contract.joints)}")
     step = float(np.median(np.diff(rows["time"][:, 0])))
     if not 0.0 < step <= SLOW:
         raise LogError(
@@ -169,7 +167,7 @@ def read_sweeps(
     for name in joints:
         span = np.flatnonzero(moved[:, contract.joints.index(name)])
         if len(span) < 2 or span[-1] + rest // 2 > len(moved):
-            raise LogError(f"{shown(path)} ends before the sweep of {name} does: record the chirp again")
+            raise LogError(f"{shown(path)} ends before the sweep of {name} ends: record the chirp again")
         part = {key: values[max(0, span[0] - rest) : span[-1] + rest] for key, values in rows.items()}
         _check_joint(path, name, contract.joints.index(name), part, step)
         sweeps.append(_sweep(contract.joints.index(name), part, contract, model, step))
@@ -187,7 +185,7 @@ def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], ste
     elif jumps > JUMP:
         why = f"its encoder jumps by {jumps:.2f} rad between two measurements"
     elif went < MOVED * told:
-        why = f"it went {went:.2f} rad where its target went {told:.2f}: its motor is loose, or it is blocked"
+        why = f"it moved by {went:.2f} rad and its target by {told:.2f} rad: its motor is loose, or it is blocked"
     else:
         return
     raise LogError(f"{shown(path)}: {name} cannot be fitted: {why}")
@@ -198,7 +196,7 @@ def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
     explained = max(0.0, 1.0 - fitted.after**2 / float(fitted.angles[0].var()))
     if explained < EXPLAINED:
         raise LogError(
-            f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.1%} of its motion: it is loose, "
+            f"{shown(path)}: {name} cannot be fitted: the fitted parameters explain {explained:.1%} of its motion: it is loose, "
             f"touches something, or carries the robot; --leave_out {name} fits the others"
         )
 

@@ -228,13 +228,14 @@ class Safety:
     def _finite(self, measured: Measurement) -> Trip | None:
         for name in ("joint_pos", "joint_vel", "gravity", "ang_vel"):
             if not np.isfinite(getattr(measured, name)).all():
-                return Trip("finite", f"what is measured is not finite: {name}")
+                return Trip("finite", f"a measured value is not finite: {name}")
         for name, (most, unit) in _ABSURD.items():
             if (value := np.abs(getattr(measured, name)).max()) > most:
-                return Trip("finite", f"what is measured cannot be: {name} of {value:.3g} {unit}")
+                return Trip("finite", f"a measured value is impossible: {name} of {value:.3g} {unit}")
         if abs((length := float(np.linalg.norm(measured.gravity))) - 1.0) > _UNIT:
             return Trip(
-                "finite", f"what is measured cannot be: gravity of length {length:.2f}, not 1: no orientation comes"
+                "finite",
+                f"a measured value is impossible: gravity of length {length:.2f}, not 1: the IMU sends no orientation",
             )
         return None
 

@@ -128,7 +128,7 @@ def _write_scene(env: RobotTask, folder: Path) -> Scene:
     cfg, robot, law = env.cfg, env.robot, env.actuators.law
     if law == OWN_LAW:
         raise ExportError(
-            f"{type(env).__name__}._compute_torques is a motor law in code, which no export can state; "
+            f"{type(env).__name__}._compute_torques is a motor law in code, which an export cannot contain; "
             "train the policy that is to be exported with a law of control.actuator (docs/motors.md)"
         )
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]

@@ -189,7 +189,7 @@ def _check_network(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> f
     gap = _gap(got, wanted)
     if not gap <= NETWORK_TOLERANCE:  # also for NaN
         raise ExportError(
-            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on "
+            f"{NETWORK_FILE} {does} differently from the trained policy: up to {gap:g} apart on "
             f"{len(wanted)} recorded observations (at most {NETWORK_TOLERANCE:g} is allowed); nothing was written"
         )
     return gap

@@ -153,7 +153,7 @@ def _check_equal(
     world, column = wrong[0]
     own = ", ".join(overridden(type(env))) or "no method"
     raise ExportError(
-        f"legged_mw.deploy would act otherwise than the environment: {what} {names[column]} is "
+        f"legged_mw.deploy would act differently from the environment: {what} {names[column]} is "
         f"{theirs[world, column]:.6g} in the environment and {ours[world, column]:.6g} by {CONTRACT_FILE}, "
         f"at step {step}. {type(env).__name__} overrides {own}. State it where the contract can take it from: "
         "an action's scale and origin in section control, a row's scale in its Row, a value of your own as a row of "

@@ -74,7 +74,7 @@ def standalone(
     spec = with_scene(robot, camera)
     if files := [field.name for field in spec.hfields if field.file]:
         raise ModelError(
-            f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers"
+            f"height field '{files[0]}' comes from a file; an export must need no other file, so build it from numbers"
         )
     what = "robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained."
     spec.comment = f"\n    {spec.modelname}: {what}\n  "
@@ -92,7 +92,7 @@ def standalone(
         raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
     if wrong := differences(robot.physics, model):
         raise ModelError(
-            f"the robot written as one MJCF would be another machine: {', '.join(wrong)} differ from the trained model"
+            f"the robot written as one MJCF has other physics: {', '.join(wrong)} differ from the trained model"
         )
     return Scene(xml, sensors)
 

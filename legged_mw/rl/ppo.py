@@ -142,7 +142,7 @@ class GraphedPPO(Recorded, PPO):
         if reason:
             if self._bound:
                 raise ConfigError(
-                    f"algorithm.max_learning_rate is of the recorded update, and this is rsl-rl's own: {reason}"
+                    f"algorithm.max_learning_rate needs the recorded update, and rsl-rl's own runs: {reason}"
                 )
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return

@@ -297,7 +297,7 @@ def _begin(runner: Runner, start: Start) -> None:
     if start.policy:
         begin_with(runner.alg.get_policy(), start.policy)
         if warmup := runner.cfg["critic_warmup"]:
-            print(f"the critic learns alone for {warmup} iterations (warm_start.critic_warmup)", flush=True)
+            print(f"only the critic learns for {warmup} iterations (warm_start.critic_warmup)", flush=True)
 
 
 def _lock(start: Start) -> RunLock:

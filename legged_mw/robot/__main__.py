@@ -28,7 +28,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--new", metavar="NAME", help="write NAME.xml and NAME_flat.py, a first task for the robot")
     parser.add_argument("--out", metavar="DIR", default=".", help="where --new writes (default: here)")
     parser.add_argument(
-        "--sim", action="store_true", help="--new writes a task for simulation alone: a told velocity, alike worlds"
+        "--sim", action="store_true", help="--new writes a task for simulation only: observed velocity, equal worlds"
     )
     parser.add_argument("--force", action="store_true", help="--new may overwrite")
     parser.add_argument(

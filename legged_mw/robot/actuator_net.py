@@ -57,8 +57,8 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
     network, gap = min(fits, key=lambda fit: fit[1])
     if not gap <= _TOLERANCE:
         raise UserError(
-            f"{file.name} computes something else than its layers with scaled inputs, by {gap:.1%} of the largest torque with the best "
-            f"activation, {network.activation}: is it fed otherwise (--frames, --in_turns)? See what it does with: "
+            f"{file.name} and its layers with scaled inputs have different outputs, by {gap:.1%} of the largest torque with the best "
+            f"activation, {network.activation}: does it have other inputs (--frames, --in_turns)? See its code with: "
             f"python -c 'import torch; print(torch.jit.load(\"{file}\").code)'"
         )
     return network, gap

@@ -51,7 +51,7 @@ _COMMENTS = {
     "pos": "[m] standing, computed",
     "damping": "[N m s/rad] LOOK: likewise",
     "armature": "[kg m^2] of the rotors, published; the file has none",
-    "integrator": "explicit Euler does not bear these gains on such light limbs",
+    "integrator": "explicit Euler is unstable with these gains on such light limbs",
     "iterations": "with fewer the physics of light limbs is not solved [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "clip_actions": "so that a joint is moved by 1 rad at most",
@@ -91,7 +91,7 @@ def targets(name: str, folder: Path, file: Path, force: bool = False) -> tuple[P
     with naming(file):
         is_own = robot.exists() and file.exists() and robot.samefile(file) and not stands_alone(file)
     if is_own:
-        raise UserError(f"{shown(robot)} is the robot's own file, which stays as it is; say another name or --out DIR")
+        raise UserError(f"{shown(robot)} is the robot's own file and is not overwritten; use another name or --out DIR")
     there = [path for path in (robot, config) if path.exists()]
     if there and not force:
         raise UserError(

@@ -153,7 +153,7 @@ def faults(health: RobotNumbers) -> list[str]:
         )
     elif health.mode.growth > 1.0 + _GROWS:
         lines.append(
-            f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains"
+            f"each servo is stable alone, but all together are unstable ({', '.join(health.mode.joints)}): lower sim.dt or the gains"
         )
     if weak := [joint for joint in joints if abs(joint.torque) > joint.effort]:
         lines.append(
@@ -208,7 +208,7 @@ def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
                 health = measure(env.robot, env.robot.pose, env.start_place, control.decimation)
                 wrong, odd = faults(health), doubtful(health, suggest(health.joints, health.moment))
         except Exception as error:  # a failed check is not a fault of the task
-            return [], [f"a few robots on their own could not be looked at: {in_short(error)}"]
+            return [], [f"the task could not be checked: {in_short(error)}"]
     return [*([ends] if ends else []), *wrong], odd
 
 

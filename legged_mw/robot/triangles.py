@@ -45,7 +45,7 @@ def read_triangles(path: Path) -> Triangles:
     if not len(found.faces) or not np.isfinite(found.points).all():
         raise ValueError("no triangles, or numbers that are not finite")
     if found.faces.min() < 0 or found.faces.max() >= len(found.points):
-        raise ValueError("a face of a point that is not there")
+        raise ValueError("a face with a missing point")
     if len(found.faces) > MOST_FACES:
         raise ValueError(f"{len(found.faces)} triangles; {MOST_FACES} are read at most")
     return found
@@ -214,7 +214,7 @@ def _corners(geometry: Element, by_id: dict[str | None, Element]) -> np.ndarray:
             triangles = np.array(fans, int).reshape(-1, 3)
         points = _points(of_points, by_id)
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(points):
-            raise ValueError("a face of a point that is not there")
+            raise ValueError("a face with a missing point")
         found.append(points[triangles])
     return np.concatenate(found)
 

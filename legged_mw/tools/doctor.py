@@ -156,7 +156,7 @@ def machine() -> Iterator[Finding]:
     if hasattr(os, "sysconf"):
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    others = "others use this machine: what is measured now is slower than it could be"
+    others = "other programs use this machine: the measured speed is too low"
     busy = others if load > usable_cores() + 0.5 else ""
     yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}; load {load:.1f}", busy)
     free = shutil.disk_usage(Path.cwd()).free / 2**30

@@ -130,9 +130,9 @@ def check_together(args: argparse.Namespace, parser: argparse.ArgumentParser) ->
     if args.export and (args.set or args.override or args.command is not None):
         parser.error("--export writes the policy as it was trained: leave --set, --override and --command out")
     if args.half and not args.export:
-        parser.error("--half rounds what is exported: add --export DIR")
+        parser.error("--half rounds an export: add --export DIR")
     if args.commands and (args.eval or args.export or args.command is not None):
-        parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
+        parser.error("--commands drives a watched robot: leave out --command, --eval and --export")
     if (args.eval or args.export) and (watching := launch.asked(args)):
         parser.error(f"--eval and --export show nothing: leave {', '.join(watching)} out")
 
@@ -252,7 +252,7 @@ class EnvStage:
         self._believed = believed_velocity(self.policy, self._obs)
         self._obs, _, dones, _ = env.step(self.policy(self._obs))
         forget(self.policy, dones)
-        self._overflowed = self._overflowed or say_overflow(env.sim, "what is shown")
+        self._overflowed = self._overflowed or say_overflow(env.sim, "the shown simulation")
 
     @property
     def news(self) -> str:

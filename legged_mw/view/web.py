@@ -114,7 +114,7 @@ class WebViewer:
         if host == LOCAL and bound[0] != LOCAL:
             self.close()
             raise ViewError(
-                f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise"
+                f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this version of mujoco binds it differently"
             )
 
     def _listens(self) -> bool:
@@ -197,7 +197,7 @@ def free_port(host: str, port: int = 0) -> int:
     """`port` if it is free; for 0 the first free port from FIRST_PORT on. Raises ViewError."""
     if not host:  # an empty host would mean all interfaces
         raise ViewError(
-            f"--host is empty; leave it out for {LOCAL}, this machine alone, or name an interface (0.0.0.0: all)"
+            f"--host is empty; leave it out for {LOCAL} (this machine only), or name an interface (0.0.0.0: all)"
         )
     candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
     for candidate in candidates:
