@@ -165,11 +165,7 @@ def test_a_scene_is_bound_to_the_contract(file: str, tmp_path: Path, capsys: pyt
     else:
         shutil.copy(ROOT / "resources/policies/go2_rough/terrain.mjz", folder)
     code, out, err = main(capsys, folder, *SHOWS)
-    assert (
-        (code, out) == (2, "")
-        and f"{file} is not the file that policy.yaml was written for" in err
-        and "--edited" in err
-    )
+    assert (code, out) == (2, "") and f"{file} is not the exported file" in err and "--edited" in err
     code, out, err = main(capsys, folder, *SHOWS, "--edited")
     assert code == 0 and f"{file}: another file than the exported one" in out, err
 

@@ -140,8 +140,8 @@ class _FunctionGuard(TorchFunctionMode):
         self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None
     ) -> Any:
         kwargs = kwargs or {}
-        if self.guard.on and (found := _breach_of_call(func, args, kwargs)):
-            raise NotRecordable(found)
+        if self.guard.on and (fault := _breach_of_call(func, args, kwargs)):
+            raise NotRecordable(fault)
         return func(*args, **kwargs)
 
 

@@ -185,9 +185,9 @@ def parse() -> argparse.Namespace:
 def _refuse(parser: Parser, args: argparse.Namespace) -> None:
     """Refuse flags of the exam, of a scene and of two policies that do not go together."""
     if args.eval and (
-        asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
+        flags := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
     ):
-        parser.error(f"--eval has its own commands, flat ground and no viewer: leave {asked[0]} out")
+        parser.error(f"--eval has its own commands, flat ground and no viewer: leave {flags[0]} out")
     if (args.second is None) != (args.switch is None):
         parser.error("--switch fall needs two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
     others = [f"--{name}" for name in ("eval", "drive", "serve", "terrain", "velocity", "scene") if getattr(args, name)]

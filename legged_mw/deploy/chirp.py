@@ -214,17 +214,17 @@ def _ends(pose: Floats, amplitude: Floats, joints: Sequence[int]) -> list[Floats
 def _clear_pose(pose: Floats, amplitude: Floats, low: Floats, high: Floats, touches: Touches) -> Floats:
     """A pose near ``pose`` from which each joint can sweep alone, if there is one."""
     default, pose = pose, pose.copy()
-    asides = sorted(ASIDE * np.arange(-FARTHEST, FARTHEST + 1), key=abs)
+    offsets = sorted(ASIDE * np.arange(-FARTHEST, FARTHEST + 1), key=abs)
     for _ in range(PASSES):
         for joint in reversed(range(len(pose))):  # the last joints of a limb first
-            angles = [default[joint] + aside for aside in asides]
+            angles = [default[joint] + offset for offset in offsets]
             inside = [angle for i, angle in enumerate(angles) if not i or low[joint] <= angle <= high[joint]]
-            met = list[int]()
+            contacts = list[int]()
             for pose[joint] in inside:
-                met.append(sum(map(touches, _ends(pose, amplitude, [joint]))))
-                if not met[-1]:
+                contacts.append(sum(map(touches, _ends(pose, amplitude, [joint]))))
+                if not contacts[-1]:
                     break
-            pose[joint] = inside[met.index(min(met))]
+            pose[joint] = inside[contacts.index(min(contacts))]
     return pose
 
 

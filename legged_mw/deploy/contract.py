@@ -411,9 +411,7 @@ def make_network(folder: Path, motors: Motors, count: int, joints: int) -> Netwo
     if not (folder / MOTORS_FILE).is_file():
         raise ContractError(f"no {MOTORS_FILE} in {folder}, the network of its motors; export the policy again")
     if digest(folder / MOTORS_FILE) != motors.digest:
-        raise ContractError(
-            f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again"
-        )
+        raise ContractError(f"{MOTORS_FILE} is not the exported file: its SHA-256 differs; export the policy again")
     return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)
 
 
@@ -691,9 +689,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
             f"{advice}"
         )
     for name in _changed_files(folder, contract):
-        raise ContractError(
-            f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {advice}"
-        )
+        raise ContractError(f"{name} is not the exported file (its SHA-256 differs): {advice}")
     return contract
 
 

@@ -135,8 +135,8 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
     for part in leave_out:
         if not any(part in name for name in contract.joints):
             raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
-    wanted = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
-    sweeps = read_sweeps(path, recording, contract, scene.model, wanted)
+    selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
+    sweeps = read_sweeps(path, recording, contract, scene.model, selected)
     fitted = [_fit_joint(Chain(scene.spec, contract, sweep)) for sweep in sweeps]
     for each in fitted:
         _check_explained(path, contract.joints[each.joint], each)
@@ -179,13 +179,13 @@ def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], ste
     target, angle, speed = (rows[key][:, joint] for key in ("target", "joint_pos", "joint_vel"))
     jumps = float(np.abs(np.diff(angle) - step * speed[1:]).max())
     slow = slice(0, round(1.5 / SLOWEST / step))  # the slowest oscillations, which each joint can follow
-    went, told = float(np.ptp(angle[slow])), float(np.ptp(target[slow]))
+    moved, commanded = float(np.ptp(angle[slow])), float(np.ptp(target[slow]))
     if not np.isfinite([angle, speed]).all() or not np.ptp(angle) > 0.0:
         why = "its encoder is dead: the angle is the same throughout"
     elif jumps > JUMP:
         why = f"its encoder jumps by {jumps:.2f} rad between two measurements"
-    elif went < MOVED * told:
-        why = f"it moved by {went:.2f} rad and its target by {told:.2f} rad: its motor is loose, or it is blocked"
+    elif moved < MOVED * commanded:
+        why = f"it moved by {moved:.2f} rad and its target by {commanded:.2f} rad: its motor is loose, or it is blocked"
     else:
         return
     raise LogError(f"{shown(path)}: {name} cannot be fitted: {why}")
@@ -208,31 +208,31 @@ def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoc
     sent = begins + np.append(rows["work"][1:, 0], rows["work"][-1:, 0])  # a row has the work of the previous step
     times = np.arange(measured[0], measured[-1], step)
     names = ("joint_pos", "joint_vel", "ang_vel", "acceleration")
-    angle, speed, gyro, felt = (
+    angle, speed, gyro, acceleration = (
         np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
     )
-    root, turn = _root_motion(contract, model, _even(gyro), felt, step)
-    slope = np.concatenate([root, _change(_even(speed)) / step], axis=1)
-    spin = np.concatenate([np.zeros(3), turn, _even(speed)[0]])
-    way, rest = step * np.cumsum(_even(speed), axis=0), round(REST / step)
-    begin = (angle - way + way[0])[:rest].mean(axis=0)
+    root, angular_velocity = _root_motion(contract, model, _smooth(gyro), acceleration, step)
+    slope = np.concatenate([root, _difference(_smooth(speed)) / step], axis=1)
+    spin = np.concatenate([np.zeros(3), angular_velocity, _smooth(speed)[0]])
+    distance, rest = step * np.cumsum(_smooth(speed), axis=0), round(REST / step)
+    begin = (angle - distance + distance[0])[:rest].mean(axis=0)
     target = rows["target"][:, joint]
     return Sweep(joint, begin, times - times[0], angle, speed, slope, spin, sent - times[0], target)
 
 
-def _even(values: Floats) -> Floats:
+def _smooth(values: Floats) -> Floats:
     """Moving average over SMOOTH rows of (T, K)."""
     padded, window = np.pad(values, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
     return np.stack([np.convolve(column, window, "valid") for column in padded.T], axis=1)
 
 
-def _change(values: Floats) -> Floats:
+def _difference(values: Floats) -> Floats:
     """Difference of each row to the next row (T, K). The last one is 0."""
     return np.diff(values, axis=0, append=values[-1:])
 
 
 def _root_motion(
-    contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: Floats, step: float
+    contract: Contract, model: mujoco.MjModel, gyro: Floats, acceleration: Floats, step: float
 ) -> tuple[Floats, Floats]:
     """(T, 6) acceleration of the root without gravity, starting level; (3,) its angular velocity at the start.
 
@@ -242,17 +242,17 @@ def _root_motion(
     data.qpos[:] = model.qpos0
     data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     mujoco.mj_kinematics(model, data)
-    place, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
+    position, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
     omega = gyro @ turn.T
-    turning = _change(omega) / step
-    felt = np.append(felt[1:], felt[-1:], axis=0)  # the accelerometer gives the mean since the last measurement
-    own = felt @ turn.T - np.cross(turning, place) - np.cross(omega, np.cross(omega, place))
-    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(own)
+    angular_acceleration = _difference(omega) / step
+    acceleration = np.append(acceleration[1:], acceleration[-1:], axis=0)  # mean since the last row
+    root = acceleration @ turn.T - np.cross(angular_acceleration, position) - np.cross(omega, np.cross(omega, position))
+    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(root)
     for i, after in enumerate(np.append(omega[1:], omega[-1:], axis=0)):
         mujoco.mju_quat2Mat(rotation, quaternion)
-        world[i] = rotation.reshape(3, 3) @ own[i]
+        world[i] = rotation.reshape(3, 3) @ root[i]
         mujoco.mju_quatIntegrate(quaternion, after, step)
-    return np.concatenate([world, turning], axis=1), omega[0]
+    return np.concatenate([world, angular_acceleration], axis=1), omega[0]
 
 
 # ---- the replay
@@ -285,14 +285,14 @@ class Chain:
 
     def simulate(self, values: Floats) -> tuple[Floats, Floats]:
         """Simulated encoder angles and speeds (K, T) with the parameters ``values`` (K, 6)."""
-        sweep, model, told = self.sweep, self.model, [*range(6), *(6 + i for i in self._all)]
+        sweep, model, columns = self.sweep, self.model, [*range(6), *(6 + i for i in self._all)]
         control = np.zeros((len(values), len(sweep.time), model.nu + model.nv))
-        pushed = [model.nu + dof for dof in (*range(6), *self._dofs)]
-        control[:, :, pushed] = HEAVY * sweep.slope[:, told]
+        forces = [model.nu + dof for dof in (*range(6), *self._dofs)]
+        control[:, :, forces] = HEAVY * sweep.slope[:, columns]
         control[:, :, model.nu + self._dof] = 0.0
         start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
         start[:, 4], qvel = 1.0, 1 + model.nq  # a state is time, position, attitude, angles, speeds
-        start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[told]
+        start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[columns]
         start[:, 1 + self._angles] = sweep.begin[self._all]
         start[:, 1 + self._angle] -= values[:, OFFSET]
         for k, numbers in enumerate(values):
@@ -310,8 +310,8 @@ class Chain:
         model.dof_armature[self._dof], model.dof_frictionloss[self._dof] = numbers[ARMATURE], numbers[FRICTION]
         model.dof_damping[self._dof] = numbers[DAMPING]
         # MuJoCo scales the softness of friction by the joint's inverse inertia, which the armature changes
-        gained = numbers[ARMATURE] - self.nominal[ARMATURE]
-        model.dof_invweight0[self._dof] = self._mobility / (1.0 + self._mobility * gained)
+        added = numbers[ARMATURE] - self.nominal[ARMATURE]
+        model.dof_invweight0[self._dof] = self._mobility / (1.0 + self._mobility * added)
         model.actuator_gainprm[self._actuator, 0] = stiffness
         model.actuator_biasprm[self._actuator, 1:3] = -stiffness, -damping
         return model
@@ -324,11 +324,11 @@ def _has_joint(model: mujoco.MjModel, name: str) -> bool:
 def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
     """Compile the robot without the bodies that ``joint`` does not move and that do not carry it."""
     spec = spec.copy()
-    body, aside = spec.joint(joint).parent, list[Any]()
+    body, others = spec.joint(joint).parent, list[Any]()
     while (parent := body.parent).name != spec.worldbody.name:
-        aside += [each for each in parent.bodies if each.name != body.name]
+        others += [each for each in parent.bodies if each.name != body.name]
         body = parent
-    for each in [*spec.sensors, *spec.keys, *aside]:
+    for each in [*spec.sensors, *spec.keys, *others]:
         spec.delete(each)
     return spec.compile()
 
@@ -345,40 +345,40 @@ def _fit_joint(chain: Chain) -> FittedJoint:
     def residual(points: Floats) -> Floats:
         """(2 T + 2, K) of scaled parameters (6, K). The last two are the prior EXPECTED, weighted like BLOCK rows."""
         numbers = points.T * _SCALE
-        found = chain.simulate(numbers)
-        missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
-        off = (numbers[:, GAIN:] - [1.0, 0.0]) / EXPECTED * BLOCK**0.5
-        return np.nan_to_num(np.concatenate([missed, off], axis=1), nan=1e6).T
+        simulated = chain.simulate(numbers)
+        errors = np.concatenate([simulated[0] / ANGLE, simulated[1] / SPEED], axis=1) - measured
+        prior = (numbers[:, GAIN:] - [1.0, 0.0]) / EXPECTED * BLOCK**0.5
+        return np.nan_to_num(np.concatenate([errors, prior], axis=1), nan=1e6).T
 
-    many = _starts(chain.nominal)
-    starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
+    candidates = _starts(chain.nominal)
+    starts = candidates[np.argsort((residual((candidates / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
     bounds = [_LOW / _SCALE, _HIGH / _SCALE]
-    ends = list[tuple[float, Floats]]()
+    results = list[tuple[float, Floats]]()
     for start in starts / _SCALE:
-        end, trace = minimize.least_squares(
+        result, trace = minimize.least_squares(
             start, residual, bounds, eps=DIFFERENCE, xtol=END, max_iter=STEPS, x_scale="jac", verbose=0
         )
-        ends.append((float(trace[-1].objective), end[:, None]))
-        if ends[-1][0] < 0.5 * NOISE**2 * len(measured):
+        results.append((float(trace[-1].objective), result[:, None]))
+        if results[-1][0] < 0.5 * NOISE**2 * len(measured):
             break
-    best = min(ends, key=lambda each: each[0])[1]
-    error = residual(best)
-    slopes, _ = minimize.jacobian_fd(
-        residual, best, error, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
+    best = min(results, key=lambda each: each[0])[1]
+    residuals = residual(best)
+    jacobian, _ = minimize.jacobian_fd(
+        residual, best, residuals, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
     )
-    deviation = _deviation(slopes, error[:, 0])
-    found = best[:, 0] * _SCALE
-    angles = np.stack([angle, *chain.simulate(np.stack([chain.nominal, found]))[0]])
+    deviation = _deviation(jacobian, residuals[:, 0])
+    fitted = best[:, 0] * _SCALE
+    angles = np.stack([angle, *chain.simulate(np.stack([chain.nominal, fitted]))[0]])
     before, after = np.sqrt(((angles[1:] - angle) ** 2).mean(axis=1)).tolist()
-    return FittedJoint(joint, found, deviation * _SCALE, before, after, sweep.time, angles)
+    return FittedJoint(joint, fitted, deviation * _SCALE, before, after, sweep.time, angles)
 
 
-def _deviation(slopes: Floats, error: Floats) -> Floats:
+def _deviation(jacobian: Floats, error: Floats) -> Floats:
     """Standard deviations (6,) from residuals (R,) and derivatives (R, 6). BLOCK consecutive rows count as one."""
-    size = np.linalg.norm(slopes, axis=0)
-    slopes = slopes / size
+    size = np.linalg.norm(jacobian, axis=0)
+    jacobian = jacobian / size
     variance = BLOCK * float(error @ error) / (len(error) - len(size))
-    return np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes))) / size
+    return np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian))) / size
 
 
 def _starts(nominal: Floats) -> Floats:
@@ -406,8 +406,8 @@ def table(fit: Fit) -> str:
         ]
         errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f}"
         lines.append("".join([f"{name:<{width}}", *(f"{cell:>20}" for cell in cells), f"{errors:>18}"]))
-    said = fit.recording.header
-    return "\n".join([*lines, f"{said['task']}, {said['robot']}, {said['began']}; fitted in {fit.seconds:.0f} s"])
+    header = fit.recording.header
+    return "\n".join([*lines, f"{header['task']}, {header['robot']}, {header['began']}; fitted in {fit.seconds:.0f} s"])
 
 
 def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
@@ -419,10 +419,10 @@ def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
     kinds = _kinds([fit.contract.joints[each.joint] for each in fit.joints])
     tables, ranges = dict[str, dict[str, float]](), dict[str, list[float]]()
     for field, column in (("armature", ARMATURE), ("frictionloss", FRICTION)):
-        found, off = values[:, column], deviation[:, column]
-        tables[field] = {kind: _short(found[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
+        fitted, spread = values[:, column], deviation[:, column]
+        tables[field] = {kind: _short(fitted[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
         mean = np.maximum([tables[field][kind] for kind in kinds], 1e-6)
-        ranges[field] = _range(found / mean, off / mean, 1e-3)
+        ranges[field] = _range(fitted / mean, spread / mean, 1e-3)
     ranges["stiffness"] = _range(values[:, GAIN], deviation[:, GAIN], 1e-3)
     own = fit.contract.damping[[each.joint for each in fit.joints]]
     if own.all():
@@ -435,8 +435,10 @@ def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
 
 def _kinds(joints: Sequence[str]) -> list[str]:
     """The part of each name that is the same for all sides: hip_joint of FL_hip_joint."""
-    rests = [name.partition("_")[2] for name in joints]
-    return [rest if rest and rests.count(rest) > 1 else name for name, rest in zip(joints, rests, strict=True)]
+    suffixes = [name.partition("_")[2] for name in joints]
+    return [
+        suffix if suffix and suffixes.count(suffix) > 1 else name for name, suffix in zip(joints, suffixes, strict=True)
+    ]
 
 
 def _range(values: Floats, deviation: Floats, least: float) -> list[float]:

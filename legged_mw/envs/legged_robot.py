@@ -320,11 +320,11 @@ class LeggedRobot(RobotTask):
 
         Their quotient is the walked share of the commanded distance.
         """
-        wanted, measured = self.commands[:, :2], self.base_lin_vel[:, :2]
-        speed = wanted.square().sum(dim=1).sqrt()
-        along = (measured * wanted).sum(dim=1) / speed.clamp(min=1e-6)
-        asked = speed > self.cfg.rewards.min_command
-        return torch.stack([torch.where(asked, each, 0.0).sum() for each in (along, speed)])
+        commanded, measured = self.commands[:, :2], self.base_lin_vel[:, :2]
+        speed = commanded.square().sum(dim=1).sqrt()
+        along = (measured * commanded).sum(dim=1) / speed.clamp(min=1e-6)
+        moving = speed > self.cfg.rewards.min_command
+        return torch.stack([torch.where(moving, each, 0.0).sum() for each in (along, speed)])
 
     def training_state(self) -> dict[str, Tensor]:
         state = super().training_state()
@@ -620,8 +620,8 @@ class LeggedRobot(RobotTask):
         """1 where feet have the clock's heights: ``rewards.swing_height`` in mid swing, 0 in stance. [P, H 5]"""
         swing = self._clock("feet_phase").swing()
         rise = 1.0 - (2.0 * swing - 1.0).abs()  # rises to 1 at mid swing, then falls
-        wanted = self.cfg.rewards.swing_height * rise.square() * (3.0 - 2.0 * rise)  # a cubic, level at both ends [P]
-        return torch.exp((self.foot_height - wanted).square().sum(dim=1) / -PHASE_SIGMA)
+        target = self.cfg.rewards.swing_height * rise.square() * (3.0 - 2.0 * rise)  # a cubic, level at both ends [P]
+        return torch.exp((self.foot_height - target).square().sum(dim=1) / -PHASE_SIGMA)
 
     def _reward_contact_phase(self) -> Tensor:
         """Share of the feet that stand or swing by the clock. [U 0.18]"""

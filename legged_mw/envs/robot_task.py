@@ -618,12 +618,12 @@ class RobotTask(BaseTask):
         """Indices of the joints that match ``wanted`` (patterns or parts of names), without held joints."""
         names, held = self.robot.joint_names, self.robot.held
         fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
-        for word, found in fits.items():
-            if not found:
+        for word, joints in fits.items():
+            if not joints:
                 raise ConfigError(f"rewards.{field}: {unknown('joint', word, names, 'the robot')}")
-            if {*found} <= {*held}:
-                self.robot.overrides.append(f"rewards.{field}: '{word}' left out, as {', '.join(found)} are held")
-        indices = [i for i, name in enumerate(names) if any(name in found for found in fits.values())]
+            if {*joints} <= {*held}:
+                self.robot.overrides.append(f"rewards.{field}: '{word}' left out, as {', '.join(joints)} are held")
+        indices = [i for i, name in enumerate(names) if any(name in joints for joints in fits.values())]
         return torch.tensor(indices, dtype=torch.long, device=self.device)
 
     def _reward_alive(self) -> Tensor:

@@ -326,7 +326,7 @@ class ExamRules:
         """The figures of the result in the table's order, including those that only ``others`` have."""
         peer, no_values = best_of(self.peers), (None, None, None)
         star = "*" if any(peer.own_speed for peer in self.peers) else ""
-        found = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
+        rows = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
         for i, (axis, unit) in enumerate(AXES):
             card = (f"{axis.removesuffix(' rate')} {self.marks_of}", unit)
             for measure, name in {
@@ -337,15 +337,15 @@ class ExamRules:
                 mark, on_card = (self.marks[i], card) if measure == self.marks_of else (None, None)
                 peer_value = peer.get(measure, no_values)[i]
                 if measure != "offset" or measure == self.marks_of or peer_value is not None:
-                    found.append(Figure(name, result[measure][i], 3, mark, peer_value, card=on_card))
+                    rows.append(Figure(name, result[measure][i], 3, mark, peer_value, card=on_card))
         if any("estimate_rms" in each for each in (result, *others)):
             rms = result.get("estimate_rms") or (None, None)
-            found += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
-        found.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
-        found.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
+            rows += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
+        rows.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
+        rows.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
         for speed, share in result["pushes"].items():
             mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
-            found.append(
+            rows.append(
                 Figure(
                     f"survives pushes of {speed} m/s",
                     share,
@@ -360,7 +360,7 @@ class ExamRules:
         name, speed_text = "cost_of_transport", f"at {self.transport_vx:g} m/s"
         card = ("cost of transport", speed_text)
         return [
-            *found,
+            *rows,
             Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=star),
         ]
 

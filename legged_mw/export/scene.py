@@ -138,12 +138,12 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
 
 def _class_of(spec: mujoco.MjSpec, name: str, box: mujoco.MjsGeom) -> mujoco.MjsDefault:
     """The default class ``name``, made from its first box without place and size. Defaults halve the file's size."""
-    found = spec.find_default(name)
-    if not found:
-        found = spec.add_default(name, spec.default)
+    default = spec.find_default(name)
+    if not default:
+        default = spec.add_default(name, spec.default)
         for field in ("type", "conaffinity", "priority", "friction", "material", "rgba"):
-            setattr(found.geom, field, getattr(box, field))
-    return found
+            setattr(default.geom, field, getattr(box, field))
+    return default
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:

@@ -138,8 +138,8 @@ class Writer(Lines):
         if name in _COPIES or (name == "bitwise_not" and self._out.dtype == torch.bool):
             name, args = ("logical_not", args) if name == "bitwise_not" else (name, args[:1])
         text = _ONE.get(name) or _TWO.get(name) or _THREE.get(name)
-        wanted = 1 if name in _ONE else 2 if name in _TWO else 3
-        if text is None or len(args) < wanted:
+        count = 1 if name in _ONE else 2 if name in _TWO else 3
+        if text is None or len(args) < count:
             raise Unfit
         kinds = self._kinds(name, args)
         if name in _FLOATS and torch.float32 not in (kinds[0], self._out.dtype):

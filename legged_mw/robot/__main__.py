@@ -55,14 +55,14 @@ def main() -> None:
     if args.new:
         # raise before the page is printed
         new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
-    found = draft(file, args.sim)
+    proposal = draft(file, args.sim)
     if args.new:
-        new.refuse_wheels(found, file)
-    env = as_env(found, file)
-    show(env, file.name, image, found)
+        new.refuse_wheels(proposal, file)
+    env = as_env(proposal, file)
+    show(env, file.name, image, proposal)
     if args.new:
         out, mirrors = Path(args.out), has_mirror(env)
-        written = new.write(found, file, args.new, out, force=args.force, mirrors=mirrors, pack=args.pack)
+        written = new.write(proposal, file, args.new, out, force=args.force, mirrors=mirrors, pack=args.pack)
         flags = shlex.join(["--task", shown(written[1]), "--check"])
         print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} {flags}")
 

@@ -42,18 +42,18 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
         raise UserError(
             f"{file} is no torchscript file, which torch.jit.script(network).save(FILE) writes: {reason}"
         ) from None
-    found = _layers({name: value.detach().numpy() for name, value in module.state_dict().items()}, file)
-    width = (found.recurrent or found.linear)[0][0].shape[1]
+    converted = _layers({name: value.detach().numpy() for name, value in module.state_dict().items()}, file)
+    width = (converted.recurrent or converted.linear)[0][0].shape[1]
     frames = tuple(frames or range(width // 2))
     if width != 2 * len(frames):
         raise UserError(
             f"{file.name} takes {width} values a joint, and --frames means {2 * len(frames)}: an error and a speed of each"
         )
-    fed = replace(found, frames=frames, **layout)
+    fed = replace(converted, frames=frames, **layout)
     states = _states()
-    wanted = _theirs(module, fed, states)
+    expected = _theirs(module, fed, states)
     activations = [*ACTIVATIONS] if len(fed.linear) > 1 else [fed.activation]
-    fits = [_fit(replace(fed, activation=name), states, wanted) for name in activations]
+    fits = [_fit(replace(fed, activation=name), states, expected) for name in activations]
     network, gap = min(fits, key=lambda fit: fit[1])
     if not gap <= _TOLERANCE:
         raise UserError(

@@ -31,8 +31,8 @@ class Maker:
 
     def of(self, table: str, joints: Sequence[str]) -> dict[str, float]:
         """Joint -> value of ``table`` (a field of this class), for those of ``joints`` that a key matches."""
-        said: dict[str, float] = getattr(self, table)
-        fitting = {key: value for key, value in said.items() if any(key in joint for joint in joints)}
+        values: dict[str, float] = getattr(self, table)
+        fitting = {key: value for key, value in values.items() if any(key in joint for joint in joints)}
         return some_joints(fitting, joints, f"{FILE}: {self.name}: {table}")
 
 

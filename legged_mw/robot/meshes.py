@@ -127,7 +127,7 @@ def _missing_pictures(spec: mujoco.MjSpec) -> dict[str, list[str]]:
         t.name: [file for file in (t.file, *t.cubefiles) if file and not path_of(spec, t, file).is_file()]
         for t in spec.textures
     }
-    return {name: gone for name, gone in files.items() if gone}
+    return {name: missing for name, missing in files.items() if missing}
 
 
 def _missing_skins(spec: mujoco.MjSpec) -> list[mujoco.MjsSkin]:
@@ -137,7 +137,7 @@ def _missing_skins(spec: mujoco.MjSpec) -> list[mujoco.MjsSkin]:
 def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """Remove skins and textures with missing files. The materials keep their colours."""
     missing = _missing_pictures(spec)
-    gone = [file for files in missing.values() for file in files] + [skin.file for skin in _missing_skins(spec)]
+    dropped = [file for files in missing.values() for file in files] + [skin.file for skin in _missing_skins(spec)]
     for skin in _missing_skins(spec):
         spec.delete(skin)
     for material in spec.materials:
@@ -145,5 +145,5 @@ def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
             material.textures = ["" if name in missing else name for name in material.textures]
     for texture in [texture for texture in spec.textures if texture.name in missing]:
         spec.delete(texture)
-    if gone:
-        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(gone))}")
+    if dropped:
+        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(dropped))}")

@@ -306,13 +306,13 @@ def as_mjcf(name: str, file: Path, folder: Path, parts: Path | None = None) -> s
 
 def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
     """Give meshes, skins and textures absolute paths, and return these. Missing files keep their paths."""
-    found: set[Path] = set()
+    paths: set[Path] = set()
 
     def named(item: mujoco.MjsMesh | mujoco.MjsTexture | mujoco.MjsSkin, file: str) -> str:
         own = item.compiler.texturedir if isinstance(item, mujoco.MjsTexture) else item.compiler.meshdir
         places = [path_of(spec, item, file), *(Path(folder) / own / file for folder in folders)]
         path = next((place.resolve() for place in places if file and place.is_file()), None)
-        found.update([path] if path else [])
+        paths.update([path] if path else [])
         return str(path) if path else file
 
     for item in (*spec.meshes, *spec.textures, *spec.skins):
@@ -320,7 +320,7 @@ def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
     for texture in spec.textures:
         texture.cubefiles = [named(texture, file) for file in texture.cubefiles]
     spec.meshdir, spec.texturedir, spec.strippath = "", "", False
-    return found
+    return paths
 
 
 def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[Path, Path]:

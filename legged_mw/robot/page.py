@@ -59,9 +59,9 @@ def page(
         lines += ["poses that were judged", *(f"  {line}" for line in poses)]
     if changed:
         lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in changed)]
-    found = [*faults(health), *doubtful(health, gains)]
+    remarks = [*faults(health), *doubtful(health, gains)]
     return "\n".join(
-        [*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])]
+        [*lines, "what to look at", *(f"  - {line}" for line in remarks or ["nothing: all numbers are within bounds"])]
     )
 
 

@@ -39,16 +39,16 @@ def read_triangles(path: Path) -> Triangles:
     if path.suffix.lower() not in readers:
         raise ValueError(f"no reader for {path.suffix}")
     try:
-        found = readers[path.suffix.lower()](path)
+        mesh = readers[path.suffix.lower()](path)
     except (IndexError, OverflowError) as error:
         raise ValueError(f"it is no {path.suffix}: {error}") from None
-    if not len(found.faces) or not np.isfinite(found.points).all():
+    if not len(mesh.faces) or not np.isfinite(mesh.points).all():
         raise ValueError("no triangles, or numbers that are not finite")
-    if found.faces.min() < 0 or found.faces.max() >= len(found.points):
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.points):
         raise ValueError("a face with a missing point")
-    if len(found.faces) > MOST_FACES:
-        raise ValueError(f"{len(found.faces)} triangles; {MOST_FACES} are read at most")
-    return found
+    if len(mesh.faces) > MOST_FACES:
+        raise ValueError(f"{len(mesh.faces)} triangles; {MOST_FACES} are read at most")
+    return mesh
 
 
 @lru_cache(maxsize=256)
@@ -191,7 +191,7 @@ def _transform(node: Element) -> np.ndarray:
 
 def _corners(geometry: Element, by_id: dict[str | None, Element]) -> np.ndarray:
     """Corners (F, 3, 3) of a geometry's triangles and polygons."""
-    found = [_NO_CORNERS]
+    parts = [_NO_CORNERS]
     for part in geometry.findall("mesh/*"):
         if part.tag not in ("triangles", "polylist", "polygons"):
             continue
@@ -215,8 +215,8 @@ def _corners(geometry: Element, by_id: dict[str | None, Element]) -> np.ndarray:
         points = _points(of_points, by_id)
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(points):
             raise ValueError("a face with a missing point")
-        found.append(points[triangles])
-    return np.concatenate(found)
+        parts.append(points[triangles])
+    return np.concatenate(parts)
 
 
 def _points(vertices: Element, by_id: dict[str | None, Element]) -> np.ndarray:

@@ -137,18 +137,18 @@ def _find_meshes(robot: Element, file: Path, notes: list[str], lost: dict[str, s
             mesh = part.find("geometry/mesh")
             if mesh is None:
                 continue
-            asked = mesh.get("filename", "")
-            path = _resolve(asked, file, meshdir)
+            filename = mesh.get("filename", "")
+            path = _resolve(filename, file, meshdir)
             reason = why_unreadable(path)
             if reason and part.tag == "collision":
                 name = link.get("name", "")
                 lost[name] = (
-                    f"{file.name}: link '{name}' collides as the mesh {asked}, which cannot be read ({reason}; looked for it "
+                    f"{file.name}: link '{name}' collides as the mesh {filename}, which cannot be read ({reason}; looked for it "
                     f"beside {file.name} and in the folders above); put it there as one of {', '.join(READABLE)}, or {SHAPES}"
                 )
-                notes.append(f"collider of '{name}' left out ({reason}): {asked}")
+                notes.append(f"collider of '{name}' left out ({reason}): {filename}")
             elif reason:
-                left_out.setdefault(reason, []).append(asked)
+                left_out.setdefault(reason, []).append(filename)
             if reason:
                 link.remove(part)
                 continue

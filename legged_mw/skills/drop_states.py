@@ -30,7 +30,7 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
     model.opt.iterations, model.opt.ls_iterations = 50, 50
     starts = _drops(model, count, np.random.default_rng(seed))
     batch = Batch(model, min(_CHUNK, -(-count // 2)), usable_cores())
-    found = [np.empty((count, size)) for size in (model.nq, model.nv)]
+    result = [np.empty((count, size)) for size in (model.nq, model.nv)]
     for half, damping in enumerate(DAMPING):  # every other state
         batch.expand("dof_damping")[:, 6:] = np.maximum(model.dof_damping[6:], damping)
         for first in range(half, count, 2 * len(batch.state)):
@@ -39,9 +39,9 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
             for name, start in zip(("qpos", "qvel"), starts, strict=True):
                 batch.bind(name)[: len(which)] = start[which]
             batch.step(nstep=round(seconds / model.opt.timestep))
-            for name, states in zip(("qpos", "qvel"), found, strict=True):
+            for name, states in zip(("qpos", "qvel"), result, strict=True):
                 states[which] = batch.bind(name)[: len(which)]
-    return found[0], found[1]
+    return result[0], result[1]
 
 
 def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -28,8 +28,8 @@ class MotionTracking(RobotTask):
 
     def _refresh_base(self) -> None:
         super()._refresh_base()
-        for kept, found in zip(self.body, self.kinematics(self.sim.qpos, self.sim.qvel), strict=True):
-            kept.copy_(found)
+        for buffer, value in zip(self.body, self.kinematics(self.sim.qpos, self.sim.qvel), strict=True):
+            buffer.copy_(value)
 
     def _update_state(self) -> None:
         super()._update_state()

@@ -87,7 +87,7 @@ def parser_of(name: str, start: Callable[[], None]) -> argparse.ArgumentParser:
     def caught(self: argparse.ArgumentParser, *_: Any, **__: Any) -> NoReturn:
         raise _Caught(self)
 
-    kept = argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv
+    saved = argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv
     argparse.ArgumentParser.parse_args = argparse.ArgumentParser.parse_known_args = caught  # type: ignore[method-assign]
     sys.argv = [f"legged-mw {name}"]
     try:
@@ -96,7 +96,7 @@ def parser_of(name: str, start: Callable[[], None]) -> argparse.ArgumentParser:
     except _Caught as found:
         return found.parser
     finally:
-        argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv = kept
+        argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv = saved
     raise UserError(f"legged-mw {name} reads no flags")
 
 

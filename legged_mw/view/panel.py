@@ -77,8 +77,8 @@ class Panel:
         if self._folded:
             ui.SetNextWindowCollapsed(True)
         try:
-            opened, kept = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
-            self._folded = not kept  # the close button folds the panel, a click on the title unfolds it
+            opened, is_open = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
+            self._folded = not is_open  # the close button folds the panel, a click on the title unfolds it
             if opened:
                 self._numbers(moment)
                 if "own" in self.pilot.can:

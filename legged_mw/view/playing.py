@@ -119,8 +119,8 @@ def parse(description: str | None) -> argparse.Namespace:
 
 def check_together(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Refuse flags that have no meaning together."""
-    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
-    if len(asked) > 1 or (args.eval and args.command is not None):
+    flags = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
+    if len(flags) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     for name, why in OF_THE_EXAM.items():
         if getattr(args, name) not in (None, False) and not args.eval:
@@ -302,19 +302,19 @@ class EnvStage:
 
 def _columns_of(env: RobotTask, wanted: str) -> list[tuple[str, slice, Tensor]]:
     """The columns of a row's newest values in the observations, also in nested groups: (group, columns, scales)."""
-    found: list[tuple[str, slice, Tensor]] = []
+    places: list[tuple[str, slice, Tensor]] = []
     for group, rows in env.observations.groups.items():
         for row in rows:
             newest = env.observations.newest(group, row.name)
             if row.name == wanted:
-                found.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
+                places.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
             elif row.group:
-                inside = [(columns, scales) for name, columns, scales in found if name == row.group]
-                found += [
+                inside = [(columns, scales) for name, columns, scales in places if name == row.group]
+                places += [
                     (group, slice(newest.start + cols.start, newest.start + cols.stop), scales)
                     for cols, scales in inside
                 ]
-    return found
+    return places
 
 
 def _array(tensor: Tensor) -> FloatArray:

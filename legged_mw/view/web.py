@@ -229,8 +229,8 @@ def tunnel_line(port: int) -> str:
     # SSH_CONNECTION: the client's address and port, then ours as the client sees them
     client = os.environ.get("SSH_CONNECTION", "").split()
     if len(client) == 4:
-        way = f"-p {client[3]} " if client[3] != "22" else ""
-        return f"ssh {way}-L {port}:{LOCAL}:{port} {user}@{client[2]}"
+        port_flag = f"-p {client[3]} " if client[3] != "22" else ""
+        return f"ssh {port_flag}-L {port}:{LOCAL}:{port} {user}@{client[2]}"
     return f"ssh -L {port}:{LOCAL}:{port} {user}@{socket.gethostname()}"
 
 
@@ -303,8 +303,8 @@ class Gate:
 
     def asked(self, target: str) -> str:
         """The token in the query of ``target``."""
-        found = re.search(r"[?&]token=([\w-]*)", target)
-        return found[1] if found else ""
+        match = re.search(r"[?&]token=([\w-]*)", target)
+        return match[1] if match else ""
 
     def greeting(self, target: str) -> dict[str, str]:
         """Headers for a first visit with the right token: set a cookie, drop the token from the address. Else empty."""

@@ -85,9 +85,9 @@ class ConcurrentModel(RegressingModel):
 
     def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         seen, known, by_teacher = regression_batch
-        wanted = run_mlp(self.teacher[1], known)
-        output = run_mlp(self.mlp, self._take_over(latent, wanted, by_teacher))
-        return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
+        target = run_mlp(self.teacher[1], known)
+        output = run_mlp(self.mlp, self._take_over(latent, target, by_teacher))
+        return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(target).detach())
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         if isinstance(normalizer := self.teacher[0], EmpiricalNormalization):

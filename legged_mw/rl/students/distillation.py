@@ -77,8 +77,8 @@ class GraphedDistillation(Recorded, Distillation):
 
     def _act(self) -> None:
         actions = sample(self.student, self.student.mlp(self._latent(self.student)))
-        wanted = self._mean(self.teacher, self._latent(self.teacher))
-        self._acted = actions.detach(), wanted.detach()
+        target = self._mean(self.teacher, self._latent(self.teacher))
+        self._acted = actions.detach(), target.detach()
 
     def _latent(self, model: MLPModel) -> Tensor:
         """The input of the network's MLP. It updates a memory with the observations."""
@@ -142,9 +142,9 @@ class GraphedDistillation(Recorded, Distillation):
             state = state.masked_fill(over, 0.0)
         return torch.cat(seen), state.detach()
 
-    def _gradient_step(self, latent: Tensor, wanted: Tensor) -> None:
+    def _gradient_step(self, latent: Tensor, target: Tensor) -> None:
         """One step towards the actions ``wanted`` (B, A). The loss is a sum of each step's mean, as in rsl-rl."""
-        loss = self.loss_fn(self._mean(self.student, latent), wanted)
+        loss = self.loss_fn(self._mean(self.student, latent), target)
         self.optimizer.zero_grad()
         (loss * self.gradient_length).backward()
         if self.is_multi_gpu:

@@ -172,10 +172,10 @@ def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) 
         if group in groups and group not in obs_groups["actor"]
     ]
     rows = {row.name: (group, row) for group in reversed(order) for row in groups[group] if not row.group}
-    found = []
+    targets = []
     for i, name in enumerate(names):
         if name not in rows and not learns and (width := env.domain_rand.widths.get(name)):
-            found.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
+            targets.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
             continue
         if name not in rows:
             hint = (
@@ -186,5 +186,5 @@ def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) 
         if name in names[:i]:
             raise ConfigError(f"{FIELD} names '{name}' twice")
         group, row = rows[name]
-        found.append((Target(name, group, env.observations.newest(group, name).start, row.column_scales()), row))
-    return found
+        targets.append((Target(name, group, env.observations.newest(group, name).start, row.column_scales()), row))
+    return targets
