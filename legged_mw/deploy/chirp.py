@@ -98,7 +98,9 @@ class Chirp(JointCheck):
     def _check(self, measured: Measurement) -> Moves:
         yield from super()._check(measured)
         if super().right:
-            self._enter(CHIRP, self._now, "the joints follow sines of rising frequency, one of each limb at a time")
+            self._enter(
+                CHIRP, self._now, "the joints follow sines of rising frequency, one joint of each limb at a time"
+            )
             yield from self._chirp(measured)
 
     def _chirp(self, begun: Measurement) -> Moves:

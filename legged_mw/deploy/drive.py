@@ -47,20 +47,18 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="drive from the terminal as on a robot: states, safety limits, a log; in real time",
     )
-    check_help = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
+    check_help = "instead of the policy, move each joint by 0.1 rad and back with a tenth of the stiffness, and compare the motion"
     parser.add_argument("--check_joints", action="store_true", help=check_help)
-    chirp_help = (
-        "the joint check, then a sweep of each joint of a hanging robot, whose log legged-mw fit reads (docs/fit.md)"
-    )
+    chirp_help = "run the joint check, then sweep each joint of a hanging robot, for legged-mw fit (docs/fit.md)"
     parser.add_argument("--chirp", action="store_true", help=chirp_help)
-    walk_help = "a robot's first walk: joint check, stand, stop, ten steps, a metre, each value beside the exam's robot"
+    walk_help = "run a robot's first walk: joint check, stand, stop, ten steps, a metre; compare with the exam's robot"
     parser.add_argument("--first_walk", action="store_true", help=walk_help)
     hoist_help = (
         "a simulated robot hangs until the policy starts (default: if it has two feet), "
-        "high: its feet in the air, as in --check_joints"
+        "high: with its feet in the air, as for --check_joints"
     )
     parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hoist_help)
-    limit_help = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
+    limit_help = "change a safety limit, e.g. tilt=45 or frozen=off (list: docs/on_the_robot.md)"
     parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limit_help)
     parser.add_argument("--gamepad", metavar="FILE", help="a gamepad (default: the first one found), or off")
     parser.add_argument(
@@ -91,7 +89,7 @@ def check_flags(args: argparse.Namespace) -> None:
     viewer_flags = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in allowed]
     driving_flag = "--drive" if args.drive else f"--robot {args.robot}" if args.robot != "simulated" else ""
     if driving_flag and (refused := [name for name, value in other_modes.items() if value] + viewer_flags):
-        raise FlagError(f"{driving_flag} is one robot in real time: leave --{refused[0]} out")
+        raise FlagError(f"{driving_flag} drives one robot in real time: leave --{refused[0]} out")
     drive_flags = {
         "hoist": args.hoist and not args.serve,
         "limit": args.limit,

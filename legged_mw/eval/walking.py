@@ -198,9 +198,7 @@ class ExamRules:
             f"{name} {low:g} to {high:g} {unit}" for (name, unit), (low, high) in zip(AXES, self.ranges, strict=True)
         ]
         common = (
-            ", the one range that all published policies of this robot were asked"
-            if COMMON.get(self.peer) == self.ranges
-            else ""
+            ", the common range of all published policies of this robot" if COMMON.get(self.peer) == self.ranges else ""
         )
         return f"asked: {', '.join(spans)}{common}"
 
@@ -212,12 +210,12 @@ class ExamRules:
         if len(self.peers) == 1:
             return f"The peer is {first.name}'s policy for this robot, graded by the same rules in MuJoCo's C engine."
         note = (
-            f"* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at {self.push_vx:g} m/s: "
+            f"* Their pushes and cost of transport were measured at half of each policy's highest vx, not at {self.push_vx:g} m/s: "
             "compare them with care."
         )
         return (
-            f"Best of {len(self.peers)}: figure by figure the best of any published policy for this robot that was asked these ranges, "
-            f"each in its own scene, in MuJoCo's C engine; no policy has them all. {note if first.own_speed else ''}"
+            f"Best of {len(self.peers)}: for each figure, the best value of the published policies for this robot with these ranges, "
+            f"each measured in its own scene in MuJoCo's C engine; no policy has all best values. {note if first.own_speed else ''}"
         ).strip()
 
     def commands(self) -> list[Velocity]:
@@ -302,11 +300,11 @@ class ExamRules:
             able[f"follow {axis} ({error:.2f} {unit} off; {limit:.2g} are allowed)"] = error <= limit
         can, cannot = ([text for text, value in able.items() if value is wanted] for wanted in (True, False))
         if not cannot:
-            hint = "play.py --eval, the whole exam and the hard one"
+            hint = "play.py --eval runs the whole exam and the hard exam"
         elif falls:
-            hint = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
+            hint = "train longer with --resume; if it still falls, weaken the kicks with --set perturbation.velocity"
         else:
-            hint = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
+            hint = "train longer with --resume; play.py --eval shows the error of each command and the survived pushes"
         return [
             f"it can: {'; '.join(can) or 'nothing yet'}",
             f"it cannot: {'; '.join(cannot) or '-'}",
@@ -448,7 +446,7 @@ def in_common(peer: str) -> dict[str, Any]:
     """
     if (robot := robot_of(peer)) not in COMMON:
         raise ConfigError(
-            f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}"
+            f"--ranges common: exam.peer is '{robot}'; a common range of all published policies is known for: {', '.join(COMMON)}"
         )
     ranges = {name: list(ends) for name, ends in zip(VELOCITY, COMMON[robot], strict=True)}
     return {"ranges": ranges, "push_vx": 0.0, "transport_vx": 0.0}

@@ -26,13 +26,13 @@ def read_urdf(source: XmlSource, notes: list[str], lost: dict[str, str]) -> tupl
     """
     file, robot = source.file, source.root
     if any(element.tag.startswith("xacro:") for element in robot.iter()):
-        raise ModelError(f"{file.name} holds xacro macros; write them out first: xacro {file.name} > robot.urdf")
+        raise ModelError(f"{file.name} has xacro macros; expand them first: xacro {file.name} > robot.urdf")
     for other in [child for child in robot if child.tag not in _KNOWN]:
         robot.remove(other)
     _drop_places(robot, notes)
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
     if mimics := [name for name, joint in joints.items() if joint.find("mimic") is not None]:
-        notes.append(f"mimic dropped: {', '.join(mimics)} move by themselves")
+        notes.append(f"mimic dropped: {', '.join(mimics)} are independent joints")
     _drop_points(robot, file, notes)
     _keep_one_material(robot, notes)
     _drop_specks(robot, notes)
