@@ -22,10 +22,10 @@ class SimToRealCfg(LeggedRobotCfg):
         num_envs = 8192
 
     class observations(LeggedRobotCfg.observations):
-        leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it; the critic sees it
+        leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it; the critic has it
 
     class commands(LeggedRobotCfg.commands):
-        curriculum = True  # [ours: with the whole range at once a Go2 only stands for minutes before it walks]
+        curriculum = True  # [ours: with the whole range, a Go2 only stands for minutes before it walks]
         curriculum_step = 0.2  # [ours]
 
     class rewards(LeggedRobotCfg.rewards):
@@ -49,7 +49,7 @@ class SimToRealCfg(LeggedRobotCfg):
     class perturbation(LeggedRobotCfg.perturbation):
         kick = True
         velocity = [0.0, 9.0]  # [m/s] [ours: docs/lab.md]
-        curriculum = True  # [ours: kicks grow as it learns to stand]
+        curriculum = True  # [ours: kicks increase as it learns to stand]
         curriculum_rate = 0.15  # [ours]
         push = True
 
@@ -63,7 +63,7 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
     class actor(LeggedRobotCfgPPO.actor):
         class distribution_cfg(LeggedRobotCfgPPO.actor.distribution_cfg):
-            init_std = 1.0  # [ours: at 0.6 a Go2 with its soft servos does not learn to step]
+            init_std = 1.0  # [ours: at 0.6 a Go2 with soft servos does not learn to step]
 
     class algorithm(LeggedRobotCfgPPO.algorithm):
         gamma = 0.97  # [ours]
@@ -82,18 +82,18 @@ class SimToRealRoughCfg(SimToRealCfg):
     """A quadruped of a Go2's size on rough ground, without a height scan. [L] legged_gym; [ours] docs/terrain.md."""
 
     class commands(SimToRealCfg.commands):
-        curriculum = False  # [ours: the ground's is enough]
+        curriculum = False  # [ours: that of the terrain is enough]
 
     class terrain(SimToRealCfg.terrain):
         mesh_type = "heightfield"
-        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        height_scan = ["privileged_state"]  # for the critic only
         terrain_proportions = {  # [ours: stairs up are learned last]
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.1, "stairs_up": 0.35, "stairs_down": 0.15},
             **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.05},
         }
 
     class termination(SimToRealCfg.termination):
-        min_base_height = 0.12  # [m] [ours: only feet touch the ground, so a trunk could sink into a step unpunished]
+        min_base_height = 0.12  # [m] [ours: only feet collide, so the trunk could sink into a step without a penalty]
 
     class rewards(SimToRealCfg.rewards):
         tracking_sigma, tracking_sigma_end = 0.25, 0.0  # [P]
@@ -113,7 +113,7 @@ class SimToRealRoughCfgPPO(SimToRealCfgPPO):
 
     class runner(SimToRealCfgPPO.runner):
         num_steps_per_env = 24  # [legged_gym]
-        max_iterations = 5600  # [ours: stairs up still get better after 18 minutes on an H200]
+        max_iterations = 5600  # [ours: stairs up still improve after 18 minutes on an H200]
 
     class algorithm(SimToRealCfgPPO.algorithm):
         gamma = 0.99  # [legged_gym]
@@ -182,7 +182,7 @@ class UprightBipedCfg(BipedCfg):
 
     class rewards(BipedCfg.rewards):
         only_positive_rewards = False  # [ours: clipped at 0, these penalties outweigh all else and nothing is learned]
-        tracking_sigma, tracking_sigma_end = 0.25, 0.15  # wide to the end it steps on the spot; at 0.1 it turns badly
+        tracking_sigma, tracking_sigma_end = 0.25, 0.15  # with a wide one it steps on the spot; at 0.1 it turns badly
         swing_height = 0.12  # [m] at 0.08 a foot that stays on the ground loses a sixth of feet_phase, and stays
 
         class scales(BipedCfg.rewards.scales):
@@ -193,8 +193,8 @@ class UprightBipedCfg(BipedCfg):
             dof_pos_limits = -10.0
             target_limits = -1.0
             pose = 1.0  # [M]
-            feet_phase = 3.0  # with 1.0 the feet chatter: 2 to 5 steps/s where the clock says 1.25
-            contact_phase = 1.0  # with it an H1 keeps the clock, and lifts its feet by 57 mm instead of 10 to 30
+            feet_phase = 3.0  # with 1.0 the feet chatter: 2 to 5 steps/s, and the clock has 1.25
+            contact_phase = 1.0  # with it an H1 keeps the clock and lifts its feet by 57 mm, not 10 to 30
             feet_impact_vel = -0.25  # no stamping
             feet_orientation = -1.0  # soles level
             dof_acc = -2e-7  # no jerks
@@ -207,7 +207,7 @@ class UprightBipedCfg(BipedCfg):
         base_mass, delay_ms = [-1.0, 5.0], [0.0, 20.0]  # [kg] of a G1, [ms]
 
     class perturbation(BipedCfg.perturbation):
-        velocity, interval = [0.0, 6.0], [4.0, 8.0]  # [m/s], [s] kicks to 8 m/s each 1 to 3 s teach it to stand still
+        velocity, interval = [0.0, 6.0], [4.0, 8.0]  # [m/s], [s] kicks to 8 m/s every 1 to 3 s teach it to stand still
         push_interval_s, max_push_vel_xy, max_push_ang_vel = 3.0, 0.5, 0.6  # [s], [m/s], [rad/s] [M: each 1 to 3 s]
 
 
@@ -223,17 +223,17 @@ class BipedRoughCfg(BipedCfg):
 
     class terrain(BipedCfg.terrain):
         mesh_type = "heightfield"
-        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        height_scan = ["privileged_state"]  # for the critic only
         difficulty = [0.0, 0.6]  # [ours: stairs up to 14 cm]
 
     class rewards(BipedCfg.rewards):
         swing_height = 0.12  # [m]
 
         class scales(BipedCfg.rewards.scales):
-            alive = 1.0  # [ours: penalties never outweigh it]
+            alive = 1.0  # [ours: penalties never exceed it]
 
     class perturbation(BipedCfg.perturbation):
-        interval = [4.0, 8.0]  # [s] [P 1 to 3; ours: time to walk between two kicks]
+        interval = [4.0, 8.0]  # [s] [P 1 to 3; ours: time to walk between kicks]
 
 
 class BipedRoughCfgPPO(BipedCfgPPO):
@@ -262,7 +262,7 @@ class BipedGetupCfg(GetupCfg):
         pull = 0.8  # of its weight [H 0.6]
 
     class control(GetupCfg.control):
-        action_origin = "default"  # [ours: with the pull its servos alone stand it up; docs/skills.md]
+        action_origin = "default"  # [ours: with the pull, its servos alone lift it; docs/skills.md]
 
     class rewards(GetupCfg.rewards):
         class scales(GetupCfg.rewards.scales):
@@ -320,7 +320,7 @@ class TrackingCfg(MotionTrackingCfg):
         num_envs = 8192
 
     class observations(MotionTrackingCfg.observations):
-        leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor gives them [B, without state estimation]
+        leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor measures them [B, without state estimation]
 
     class normalization(MotionTrackingCfg.normalization):
         clip_actions = 10.0  # [ours: B has no bound; in a squat the knees are 4 action scales from the default pose]
@@ -349,4 +349,4 @@ class TrackingCfgPPO(RobotTaskCfgPPO):
         hidden_dims = [224, 128, 64]  # [ours: one clip needs less than B's 512, 256, 128]
 
         class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            init_std = 0.4  # [ours: with B's 1.0 action_rate at first outweighs tracking, and it learns to fall soon]
+            init_std = 0.4  # [ours: with B's 1.0, action_rate first exceeds tracking, and it learns to fall early]
