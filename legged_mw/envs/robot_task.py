@@ -704,7 +704,7 @@ class RobotTask(BaseTask):
         return (self.dof_vel.abs() - self.soft_speed).clamp(0.0, 1.0).sum(dim=1)
 
     def _reward_fast_joints(self) -> Tensor:
-        """Squared joint speeds beyond a turn a second [rad^2/s^2]. [P]"""
+        """Squared joint speeds beyond one turn per second [rad^2/s^2]. [P]"""
         return (self.dof_vel.abs() - 2.0 * torch.pi).clamp(min=0.0).square().sum(dim=1)
 
     def _reward_torque_limits(self) -> Tensor:

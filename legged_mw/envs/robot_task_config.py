@@ -1,4 +1,4 @@
-"""Every field of RobotTask, typed, with unit and source. Tasks override these in configs/.
+"""All fields of RobotTask, with type, unit and source. Tasks override them in configs/.
 
 Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
 "A table a joint" maps keys to values. A joint has that of its exact name, else of the longest key in it, or of "".

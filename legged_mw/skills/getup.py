@@ -30,13 +30,13 @@ GIVEN_BACK = 3.0
 
 class GetupCfg(SkillCfg):
     class falls:
-        share: Share = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
-        states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
+        share: Share = 0.75  # share of episodes that begin after a fall; the others begin standing [P 0.6]
+        states: Count = 2048  # number of states after falls; at most four per world are made [ours]
         seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
-        seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has its own
-        pull: Share = 0.0  # lifting force, as a share of the weight; it fades as robots learn [H 0.6]
-        pull_on: str = ""  # body that it lifts; empty: the root (a robot with a heavy trunk then hangs head down)
-        pull_fades: PositiveShare = 0.2  # share by which it falls when every world has ended an episode up [ours]
+        seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has another
+        pull: Share = 0.0  # lifting force, as a share of the weight; it decreases as robots learn [H 0.6]
+        pull_on: str = ""  # lifted body; empty: the root (a robot with a heavy trunk then hangs head down)
+        pull_fades: PositiveShare = 0.2  # decrease of the force when every world has ended an episode up [ours]
 
     class env(SkillCfg.env):
         episode_length_s = 6.0  # [s] [P]
