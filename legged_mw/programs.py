@@ -243,8 +243,8 @@ def main() -> None:
     if name not in PROGRAMS:
         close = difflib.get_close_matches(name, PROGRAMS, n=1)
         hint = f", did you mean {close[0]!r}? " if close else "; "
-        asked = f"no program {name!r}{hint}" if name else ""
-        fail("legged-mw", f"{asked}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat")
+        problem = f"no program {name!r}{hint}" if name else ""
+        fail("legged-mw", f"{problem}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat")
     sys.argv = [f"legged-mw {name}", *sys.argv[2:]]
     PROGRAMS[name]()
 

@@ -100,8 +100,8 @@ class Reader:
 
     def scale(self, count: int, of: str) -> np.ndarray:
         """The value of ``scale``: one number per value. The file may give one number for all."""
-        wanted = f"a number, or {count} numbers, one a {of}"
-        value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
+        expected = f"a number, or {count} numbers, one a {of}"
+        value = self.take("scale", expected, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
         self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
         return np.full(count, value, dtype=float) if is_number(value) else np.array(value, dtype=float)
 
@@ -263,9 +263,9 @@ class NetworkMemory(NamedTuple):
 
 def read_memory(section: Reader) -> NetworkMemory:
     """Read the section ``memory``."""
-    wanted = "two whole numbers from 1: states and the size of each"
+    expected = "two whole numbers from 1: states and the size of each"
     shape = section.take(
-        "shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
+        "shape", expected, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
     )
     section.take("shape", f"{MOST_VALUES} values at most", lambda v: v[0] * v[1] <= MOST_VALUES)
     return NetworkMemory(section.text("input"), section.text("output"), tuple(shape))
@@ -368,10 +368,12 @@ def read_ratings(section: Reader, joints: int) -> Ratings:
     for name in section.values:
         if name not in Ratings._fields:
             raise ContractError(f"{section.where}: {unknown('rating', name, Ratings._fields, RATINGS)}")
-    tables, wanted = {}, f"a number above zero, or {joints} of them, one a joint, null where unknown"
+    tables, expected = {}, f"a number above zero, or {joints} of them, one a joint, null where unknown"
     for name in TABLES:
         if name in section.values:
-            value = section.take(name, wanted, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints))
+            value = section.take(
+                name, expected, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints)
+            )
             tables[name] = value if isinstance(value, list) else [value] * joints
     return make_ratings(tables, section.above_zero(BATTERY) if BATTERY in section.values else None, joints)
 

@@ -403,8 +403,8 @@ class LeggedRobot(RobotTask):
 
     def _episode_columns(self) -> dict[str, int]:
         times = ["feet_contact_time", "last_air_time", "last_contact_time"]
-        wanted = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
-        of_feet = [name for term in self._active_scales() for name in wanted.get(term, [])]
+        optional = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
+        of_feet = [name for term in self._active_scales() for name in optional.get(term, [])]
         of_feet += ["feet_air_time", "swing_peak"]
         ground = ["progress", "commanded_distance", "commanded_speed", "max_distance"] if self.terrain else []
         feet, walk = dict.fromkeys(of_feet, len(self.foot_names)), dict.fromkeys(ground, 1)

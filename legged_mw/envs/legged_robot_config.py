@@ -164,8 +164,8 @@ class LeggedRobotCfg(RobotTaskCfg):
         super().check()
         feet, commands = self.asset.foot_names, self.commands
         if not feet or "*" in "".join(feet) or len({*feet}) < len(feet):
-            wanted = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
-            raise ConfigError(f"asset.foot_names is {feet!r}; it must be {wanted}")
+            expected = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
+            raise ConfigError(f"asset.foot_names is {feet!r}; it must be {expected}")
         for name, span in vars(commands.ranges).items():  # a task may have declared its own
             fit(span, Range, f"commands.ranges.{name}")
         names = [name for name in vars(commands.ranges) if name != HEADING]

@@ -815,9 +815,9 @@ def check_term(method: Callable[[], Any], count: int) -> Tensor:
     """The value of a reward method. Raises StepError, with the method's file and line, unless its shape is (count,)."""
     value = method()
     if not isinstance(value, Tensor) or value.shape != (count,):
-        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        wanted = f"must return a tensor ({count},), one value an environment"
-        raise StepError(f"{wanted}; it returned {got}", place_of(method))
+        actual = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        expected = f"must return a tensor ({count},), one value an environment"
+        raise StepError(f"{expected}; it returned {actual}", place_of(method))
     return value
 
 

@@ -241,9 +241,11 @@ def built_meshes(source: str) -> dict[str, str]:
         ]
     except ElementTree.ParseError:
         return {}
-    wanted = ("builtin", "params")
+    attributes = ("builtin", "params")
     return {
-        mesh.attrib["name"]: " ".join(f"{key}={quoteattr(mesh.attrib[key])}" for key in wanted if key in mesh.attrib)
+        mesh.attrib["name"]: " ".join(
+            f"{key}={quoteattr(mesh.attrib[key])}" for key in attributes if key in mesh.attrib
+        )
         for mesh in meshes
     }
 

@@ -38,11 +38,11 @@ def count_contacts(model: mujoco.MjModel, put: mjw.Model) -> Callable[[mjw.Data]
     sensors = countable(model)
     left = [int(i) for i in put.sensor_contact_pos_adr.numpy() if int(i) not in sensors]
     put.sensor_contact_pos_adr = wp.array(left, dtype=int)
-    wanted = wp.array([*sensors.values()], dtype=wp.vec3i)
+    table = wp.array([*sensors.values()], dtype=wp.vec3i)
 
     def count(d: mjw.Data) -> None:
         contact = d.contact
-        inputs = [wanted, contact.geom, contact.worldid, contact.type, d.nacon]
+        inputs = [table, contact.geom, contact.worldid, contact.type, d.nacon]
         wp.launch(_count, dim=(contact.geom.shape[0], len(sensors)), inputs=inputs, outputs=[d.sensordata])
 
     return count

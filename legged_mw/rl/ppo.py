@@ -367,8 +367,8 @@ class GraphedPPO(Recorded, PPO):
             kl = None  # the actor did not change, so the KL is rounding noise
         else:
             gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # affects the estimator only
-            wanted = [(value, gradient) for value, gradient in gradients if value.requires_grad]
-            torch.autograd.backward(*zip(*wanted, strict=True))  # type: ignore[arg-type]
+            trained = [(value, gradient) for value, gradient in gradients if value.requires_grad]
+            torch.autograd.backward(*zip(*trained, strict=True))  # type: ignore[arg-type]
         self._meet()
         self._step(kl)
         self._losses.add_(torch.stack([value.detach() for value in (of_critic, *parts, *regression)]))

@@ -121,21 +121,21 @@ def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
 
 def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, ...]:
     """A kind for each column, in the given order. Shares are rounded to whole columns, at least one per kind."""
-    wanted = {kind: share for kind, share in proportions.items() if share > 0}
-    if not wanted:
+    shares = {kind: share for kind, share in proportions.items() if share > 0}
+    if not shares:
         none = f"no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}"
         raise ModelError.of(("proportions", none))
-    if len(wanted) > columns:
-        few = f"{columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one"
+    if len(shares) > columns:
+        few = f"{columns} columns cannot hold {len(shares)} kinds; every kind with a share above 0 needs one"
         raise ModelError.of(("columns", few))
-    bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
-    places = np.searchsorted(bounds, (np.arange(columns) + 0.5) / columns).clip(max=len(wanted) - 1)
-    kinds = [list(wanted)[place] for place in places]
-    for kind in wanted:
+    bounds = np.cumsum(list(shares.values())) / sum(shares.values())
+    places = np.searchsorted(bounds, (np.arange(columns) + 0.5) / columns).clip(max=len(shares) - 1)
+    kinds = [list(shares)[place] for place in places]
+    for kind in shares:
         if kind not in kinds:
-            most = max(wanted, key=kinds.count)
+            most = max(shares, key=kinds.count)
             kinds[len(kinds) - 1 - kinds[::-1].index(most)] = kind
-    return tuple(sorted(kinds, key=list(wanted).index))
+    return tuple(sorted(kinds, key=list(shares).index))
 
 
 # ---- kinds of ground: (n + 1, n + 1) heights, flat at the centre and zero at the rim, so that tiles fit together

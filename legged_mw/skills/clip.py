@@ -93,8 +93,8 @@ def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
     for key, array in arrays.items():
         kinds, axes = ("US" if key == "joint_names" else "fiu"), {"fps": 0, "joint_names": 1}.get(key, 2)
         if array.dtype.kind not in kinds or array.ndim != axes:
-            wanted = f"{'text' if kinds == 'US' else 'numbers'} along {axes} axes"
-            raise ClipError(f"{path}: {key} is {array.dtype} along {array.ndim} axes; it must be {wanted}")
+            expected = f"{'text' if kinds == 'US' else 'numbers'} along {axes} axes"
+            raise ClipError(f"{path}: {key} is {array.dtype} along {array.ndim} axes; it must be {expected}")
     names = tuple(map(str, arrays["joint_names"]))
     return checked(path, float(arrays["fps"]), names, *(arrays[key] for key in KEYS[2:]))
 
@@ -106,9 +106,9 @@ def checked(
     pos, quat, joints = (np.array(values, dtype=np.float64) for values in (root_pos, root_quat, joint_pos))
     frames = len(pos)
     if frames < 2 or (pos.shape, quat.shape, joints.shape) != ((frames, 3), (frames, 4), (frames, len(names))):
-        found = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape} for {len(names)} joints"
-        wanted = f"there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
-        raise ClipError(f"{path}: {found}; {wanted}")
+        actual = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape} for {len(names)} joints"
+        expected = f"there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
+        raise ClipError(f"{path}: {actual}; {expected}")
     length = np.linalg.norm(quat, axis=1, keepdims=True)
     finite = all(np.isfinite(values).all() for values in (pos, quat, joints))
     if not finite or not fps > 0 or (np.abs(length - 1.0) > 0.01).any():

@@ -177,9 +177,9 @@ def training() -> Iterator[Finding]:
         if needs.marker is None:
             version = _version(needs.name)
             fits = bool(version) and needs.specifier.contains(version, prereleases=True)
-            wanted = "" if fits or not version else f", which is not {needs.specifier}"
+            note = "" if fits or not version else f", which is not {needs.specifier}"
             mend = "" if fits else f"pip install '{needs}'"
-            yield Finding(needs.name, f"{version or 'missing'}{wanted}", mend, needed=not version)
+            yield Finding(needs.name, f"{version or 'missing'}{note}", mend, needed=not version)
 
 
 def gpus() -> Iterator[Finding]:
@@ -203,8 +203,8 @@ def gpus() -> Iterator[Finding]:
     for index in range(torch.cuda.device_count()):
         facts = device_facts(device := f"cuda:{index}")
         driver = ".".join(map(str, facts.cuda or ()))
-        said = f"{facts.name}, {facts.memory:.0f} GiB, driver for CUDA {driver}, torch {torch.__version__}"
-        yield Finding(device, said)
+        text = f"{facts.name}, {facts.memory:.0f} GiB, driver for CUDA {driver}, torch {torch.__version__}"
+        yield Finding(device, text)
         yield Finding("memory pool", "yes" if facts.pool else "no")
         yield Finding("graphs", _records(device))
         yield Finding("kernels", f"{facts.compiled} modules of mujoco-warp are compiled for it in {facts.cache}")

@@ -124,9 +124,9 @@ class Pilot:
         """Drive by the command, at first the robot's `own` (C,), with `value` in this column, from the next turn on."""
 
         def change() -> None:
-            wanted = np.array(self.command if self.driving else own)
-            wanted[column] = value
-            self._steer(wanted)
+            values = np.array(self.command if self.driving else own)
+            values[column] = value
+            self._steer(values)
 
         self._asked.put(change)
 

@@ -115,9 +115,9 @@ class GraphedDistillation(Recorded, Distillation):
         self._loss.zero_()
         for _ in range(self.num_learning_epochs):
             state = memory.start[:, 0] if memory else None
-            for inputs, wanted, ended in chunks:
+            for inputs, targets, ended in chunks:
                 latent, state = self._unroll(inputs, ended, state)
-                self._gradient_step(latent, wanted.flatten(0, 1))
+                self._gradient_step(latent, targets.flatten(0, 1))
         self._loss /= self.num_learning_epochs * len(chunks)
         if memory and state is not None:
             memory.now[:, 0].copy_(state)  # of the updated student, as in rsl-rl
