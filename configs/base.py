@@ -1,6 +1,6 @@
-"""Presets that tasks of different robots share: walking, getting up, standing on two of four legs, following a motion.
+"""Presets for tasks of different robots: walking, getting up, standing on two of four legs, tracking a motion.
 
-They are meant for a real robot. A robot's own names and numbers are in configs/robots/.
+They are for use on real robots. A robot's names and numbers are in configs/robots/.
 
 Sources: [I] Isaac Lab's G1, [M] mjlab's velocity task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks,
 [U] unitree_rl_gym's G1, [H] HoST, a G1 with 23 joints, [B] BeyondMimic; [ours] is measured: docs/lab.md.
@@ -16,16 +16,16 @@ from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 
 
 class SimToRealCfg(LeggedRobotCfg):
-    """A robot that walks by command and does not know its velocity."""
+    """A robot that walks by command, without a measured velocity."""
 
     class env(LeggedRobotCfg.env):
         num_envs = 8192
 
     class observations(LeggedRobotCfg.observations):
-        leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it; the critic sees it
+        leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it; the critic has it
 
     class commands(LeggedRobotCfg.commands):
-        curriculum = True  # [ours: with the whole range at once a Go2 only stands for minutes before it walks]
+        curriculum = True  # [ours: with the whole range, a Go2 only stands for minutes before it walks]
         curriculum_step = 0.2  # [ours]
 
     class rewards(LeggedRobotCfg.rewards):
@@ -49,13 +49,13 @@ class SimToRealCfg(LeggedRobotCfg):
     class perturbation(LeggedRobotCfg.perturbation):
         kick = True
         velocity = [0.0, 9.0]  # [m/s] [ours: docs/lab.md]
-        curriculum = True  # [ours: kicks grow as it learns to stand]
+        curriculum = True  # [ours: kicks increase as it learns to stand]
         curriculum_rate = 0.15  # [ours]
         push = True
 
 
 class SimToRealCfgPPO(LeggedRobotCfgPPO):
-    """The learner of SimToRealCfg."""
+    """The learner's config for SimToRealCfg."""
 
     class runner(LeggedRobotCfgPPO.runner):
         num_steps_per_env = 12  # [ours]
@@ -63,7 +63,7 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
     class actor(LeggedRobotCfgPPO.actor):
         class distribution_cfg(LeggedRobotCfgPPO.actor.distribution_cfg):
-            init_std = 1.0  # [ours: at 0.6 a Go2 with its soft servos does not learn to step]
+            init_std = 1.0  # [ours: at 0.6 a Go2 with soft servos does not learn to step]
 
     class algorithm(LeggedRobotCfgPPO.algorithm):
         gamma = 0.97  # [ours]
@@ -79,21 +79,21 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
 
 class SimToRealRoughCfg(SimToRealCfg):
-    """A quadruped of a Go2's size on rough ground that it does not see. [L] legged_gym; [ours] docs/terrain.md."""
+    """A quadruped of a Go2's size on rough ground, without a height scan. [L] legged_gym; [ours] docs/terrain.md."""
 
     class commands(SimToRealCfg.commands):
-        curriculum = False  # [ours: the ground's is enough]
+        curriculum = False  # [ours: that of the terrain is enough]
 
     class terrain(SimToRealCfg.terrain):
         mesh_type = "heightfield"
-        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        height_scan = ["privileged_state"]  # for the critic only
         terrain_proportions = {  # [ours: stairs up are learned last]
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.1, "stairs_up": 0.35, "stairs_down": 0.15},
             **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.05},
         }
 
     class termination(SimToRealCfg.termination):
-        min_base_height = 0.12  # [m] [ours: only feet touch the ground, so a trunk could sink into a step unpunished]
+        min_base_height = 0.12  # [m] [ours: only feet collide, so the trunk could sink into a step without a penalty]
 
     class rewards(SimToRealCfg.rewards):
         tracking_sigma, tracking_sigma_end = 0.25, 0.0  # [P]
@@ -109,11 +109,11 @@ class SimToRealRoughCfg(SimToRealCfg):
 
 
 class SimToRealRoughCfgPPO(SimToRealCfgPPO):
-    """Its learner on rough ground: longer rollouts and a longer horizon."""
+    """The learner's config on rough ground: longer rollouts and a longer horizon."""
 
     class runner(SimToRealCfgPPO.runner):
         num_steps_per_env = 24  # [legged_gym]
-        max_iterations = 5600  # [ours: stairs up still get better after 18 minutes on an H200]
+        max_iterations = 5600  # [ours: stairs up still improve after 18 minutes on an H200]
 
     class algorithm(SimToRealCfgPPO.algorithm):
         gamma = 0.99  # [legged_gym]
@@ -121,7 +121,7 @@ class SimToRealRoughCfgPPO(SimToRealCfgPPO):
 
 
 class BipedCfg(SimToRealCfg):
-    """A biped that walks by command and does not know its velocity."""
+    """A biped that walks by command, without a measured velocity."""
 
     class gait(SimToRealCfg.gait):
         period = 0.8  # [s] [U]
@@ -165,7 +165,7 @@ class BipedCfg(SimToRealCfg):
 
 
 class BipedCfgPPO(SimToRealCfgPPO):
-    """Its learner."""
+    """The learner's config of a biped."""
 
     class runner(SimToRealCfgPPO.runner):
         num_steps_per_env, max_iterations = 16, 3000  # [ours]
@@ -175,14 +175,14 @@ class BipedCfgPPO(SimToRealCfgPPO):
 
 
 class UprightBipedCfg(BipedCfg):
-    """A biped that walks upright: penalties count in full, and tracking outweighs them.
+    """A biped that walks upright: penalties are not clipped, and tracking has a larger weight.
 
     Numbers without a source: [ours: docs/archive/go2_and_g1.md, drafts on two feet].
     """
 
     class rewards(BipedCfg.rewards):
         only_positive_rewards = False  # [ours: clipped at 0, these penalties outweigh all else and nothing is learned]
-        tracking_sigma, tracking_sigma_end = 0.25, 0.15  # wide to the end it steps on the spot; at 0.1 it turns badly
+        tracking_sigma, tracking_sigma_end = 0.25, 0.15  # with a wide one it steps on the spot; at 0.1 it turns badly
         swing_height = 0.12  # [m] at 0.08 a foot that stays on the ground loses a sixth of feet_phase, and stays
 
         class scales(BipedCfg.rewards.scales):
@@ -193,8 +193,8 @@ class UprightBipedCfg(BipedCfg):
             dof_pos_limits = -10.0
             target_limits = -1.0
             pose = 1.0  # [M]
-            feet_phase = 3.0  # with 1.0 the feet chatter: 2 to 5 steps/s where the clock says 1.25
-            contact_phase = 1.0  # with it an H1 keeps the clock, and lifts its feet by 57 mm instead of 10 to 30
+            feet_phase = 3.0  # with 1.0 the feet chatter: 2 to 5 steps/s, and the clock has 1.25
+            contact_phase = 1.0  # with it an H1 keeps the clock and lifts its feet by 57 mm, not 10 to 30
             feet_impact_vel = -0.25  # no stamping
             feet_orientation = -1.0  # soles level
             dof_acc = -2e-7  # no jerks
@@ -207,37 +207,37 @@ class UprightBipedCfg(BipedCfg):
         base_mass, delay_ms = [-1.0, 5.0], [0.0, 20.0]  # [kg] of a G1, [ms]
 
     class perturbation(BipedCfg.perturbation):
-        velocity, interval = [0.0, 6.0], [4.0, 8.0]  # [m/s], [s] kicks to 8 m/s each 1 to 3 s teach it to stand still
+        velocity, interval = [0.0, 6.0], [4.0, 8.0]  # [m/s], [s] kicks to 8 m/s every 1 to 3 s teach it to stand still
         push_interval_s, max_push_vel_xy, max_push_ang_vel = 3.0, 0.5, 0.6  # [s], [m/s], [rad/s] [M: each 1 to 3 s]
 
 
 class UprightBipedCfgPPO(BipedCfgPPO):
-    """Its learner."""
+    """The learner's config of an upright biped."""
 
     class anneal(BipedCfgPPO.anneal):
         desired_kl = 0.0  # [ours: not annealed; if it shrinks, the learning rate falls to 1e-5]
 
 
 class BipedRoughCfg(BipedCfg):
-    """A biped of a G1's size on rough ground that it does not see."""
+    """A biped of a G1's size on rough ground, without a height scan."""
 
     class terrain(BipedCfg.terrain):
         mesh_type = "heightfield"
-        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        height_scan = ["privileged_state"]  # for the critic only
         difficulty = [0.0, 0.6]  # [ours: stairs up to 14 cm]
 
     class rewards(BipedCfg.rewards):
         swing_height = 0.12  # [m]
 
         class scales(BipedCfg.rewards.scales):
-            alive = 1.0  # [ours: penalties never outweigh it]
+            alive = 1.0  # [ours: penalties never exceed it]
 
     class perturbation(BipedCfg.perturbation):
-        interval = [4.0, 8.0]  # [s] [P 1 to 3; ours: time to walk between two kicks]
+        interval = [4.0, 8.0]  # [s] [P 1 to 3; ours: time to walk between kicks]
 
 
 class BipedRoughCfgPPO(BipedCfgPPO):
-    """Its learner on rough ground."""
+    """The learner's config of a biped on rough ground."""
 
     class runner(BipedCfgPPO.runner):
         num_steps_per_env, max_iterations = 24, 1320  # [legged_gym], [ours: 420 s of a G1 on an H200]
@@ -262,7 +262,7 @@ class BipedGetupCfg(GetupCfg):
         pull = 0.8  # of its weight [H 0.6]
 
     class control(GetupCfg.control):
-        action_origin = "default"  # [ours: with the pull its servos alone stand it up; docs/skills.md]
+        action_origin = "default"  # [ours: with the pull, its servos alone lift it; docs/skills.md]
 
     class rewards(GetupCfg.rewards):
         class scales(GetupCfg.rewards.scales):
@@ -273,7 +273,7 @@ class BipedGetupCfg(GetupCfg):
 
 
 class BipedGetupCfgPPO(GetupCfgPPO):
-    """Its learner."""
+    """The learner's config of a biped that gets up."""
 
     class runner(GetupCfgPPO.runner):
         max_iterations = 4000
@@ -284,7 +284,7 @@ class BipedGetupCfgPPO(GetupCfgPPO):
 
 
 class UnitreeHandstandCfg(HandstandCfg):
-    """A handstand of a quadruped with legs FR, FL, RR, RL: it stands on the front ones."""
+    """A handstand of a quadruped with legs FR, FL, RR, RL, on the front legs."""
 
     class asset(HandstandCfg.asset):
         penalize_contacts_on = ["RR*", "RL*"]
@@ -297,9 +297,10 @@ class UnitreeHandstandCfg(HandstandCfg):
 
 
 class UnitreeFootstandCfg(HandstandCfg):
-    """A footstand of such a quadruped: it stands on the rear legs.
+    """A footstand of such a quadruped, on the rear legs.
 
-    In [P] contacts of the front legs end an episode; here, as in a handstand, those of the standing legs (but feet).
+    In [P] a contact of the front legs ends an episode. Here, as in a handstand, those of the standing legs do, except
+    of the feet.
     """
 
     class asset(HandstandCfg.asset):
@@ -313,13 +314,13 @@ class UnitreeFootstandCfg(HandstandCfg):
 
 
 class TrackingCfg(MotionTrackingCfg):
-    """Following a motion without knowing one's place or velocity, in randomized worlds."""
+    """Tracking a motion without measured position and velocity, in randomized worlds."""
 
     class env(MotionTrackingCfg.env):
         num_envs = 8192
 
     class observations(MotionTrackingCfg.observations):
-        leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor gives them [B, without state estimation]
+        leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor measures them [B, without state estimation]
 
     class normalization(MotionTrackingCfg.normalization):
         clip_actions = 10.0  # [ours: B has no bound; in a squat the knees are 4 action scales from the default pose]
@@ -336,7 +337,7 @@ class TrackingCfg(MotionTrackingCfg):
 
 
 class TrackingCfgPPO(RobotTaskCfgPPO):
-    """The learner of one clip, of a humanoid."""
+    """The learner's config for one clip of a humanoid."""
 
     class algorithm(RobotTaskCfgPPO.algorithm):
         desired_kl = 0.02  # [ours: over 29 joints, as a walking G1's]
@@ -348,4 +349,4 @@ class TrackingCfgPPO(RobotTaskCfgPPO):
         hidden_dims = [224, 128, 64]  # [ours: one clip needs less than B's 512, 256, 128]
 
         class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            init_std = 0.4  # [ours: with B's 1.0 action_rate at first outweighs tracking, and it learns to fall soon]
+            init_std = 0.4  # [ours: with B's 1.0, action_rate first exceeds tracking, and it learns to fall early]

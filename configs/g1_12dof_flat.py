@@ -1,4 +1,4 @@
-"""Unitree G1 walks on its legs alone; waist and arms are held, as on Unitree's G1 with 12 joints."""
+"""Unitree G1 walks with its legs only; waist and arms are held, as on Unitree's G1 with 12 joints."""
 
 from configs.base import UprightBipedCfg, UprightBipedCfgPPO
 from configs.robots.g1 import WalkingG1

@@ -1,4 +1,4 @@
-"""Unitree G1 (29 joints) follows a joystick on flat ground without knowing its velocity; random worlds, pushes."""
+"""Unitree G1 (29 joints) follows a joystick on flat ground, without measured velocity; randomized worlds, pushes."""
 
 from configs.base import BipedCfg, BipedCfgPPO
 from configs.robots.g1 import WalkingG1

@@ -1,4 +1,4 @@
-"""Unitree G1 with 29 joints gets up from any fall and stays standing; randomized worlds."""
+"""Unitree G1 with 29 joints gets up after any fall and stays standing; randomized worlds."""
 
 from configs.base import BipedGetupCfg, BipedGetupCfgPPO
 from configs.robots.g1 import G1
@@ -8,7 +8,7 @@ from legged_mw.utils.task import Task
 
 class G1GetupCfg(G1, BipedGetupCfg):
     class falls(BipedGetupCfg.falls):
-        pull_on = "torso_link"  # [ours: lifted by the pelvis it hangs head down]
+        pull_on = "torso_link"  # [ours: lifted at the pelvis, it hangs head down]
 
     class normalization(BipedGetupCfg.normalization):
         clip_actions = 8.0  # [ours: folded knees are 2.6 rad away]

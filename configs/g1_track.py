@@ -1,4 +1,4 @@
-"""Unitree G1 with 29 joints follows a motion, a side kick held in balance, without knowing its place or its velocity.
+"""Unitree G1 with 29 joints tracks a motion, a held side kick, without measured position and velocity.
 
 With state estimation, as in BeyondMimic: --set "observations.leave_out={}" (docs/motions.md).
 """

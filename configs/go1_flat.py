@@ -15,7 +15,7 @@ class Go1FlatCfg(WalkingGo1):
 
     class sim(WalkingGo1.sim):
         nconmax = 8
-        njmax = 40  # 12 friction, 12 limits, 4 a contact of four feet [ours: never seen full]
+        njmax = 40  # 12 friction, 12 limits, 4 per contact of four feet [ours: never full]
 
     class rewards(WalkingGo1.rewards):
         tracking_sigma = 0.2  # [P 0.25] [ours: vx 0.019 m/s instead of 0.024; docs/lab.md]
@@ -25,8 +25,8 @@ class Go1FlatCfg(WalkingGo1):
             tracking_ang_vel = 1.0  # [P 0.5] [ours: likewise]
 
     class perturbation(WalkingGo1.perturbation):
-        kick = True  # [ours: trained without, a quarter of pushes of 2 m/s topple it; docs/lab.md]
-        velocity = [0.0, 8.0]  # [m/s] [ours: with up to 3, an eighth still do]
+        kick = True  # [ours: without kicks, a quarter of pushes of 2 m/s topple it; docs/lab.md]
+        velocity = [0.0, 8.0]  # [m/s] [ours: with up to 3, an eighth of them still do]
 
     class exam(WalkingGo1.exam):  # [ours: as for P's policy]
         push_speeds = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]  # [m/s]
@@ -37,12 +37,12 @@ class Go1FlatCfg(WalkingGo1):
 
 class Go1FlatCfgPPO(LeggedRobotCfgPPO):
     class runner(LeggedRobotCfgPPO.runner):
-        num_steps_per_env = 16  # [ours: sooner walking than 12 or 24]
+        num_steps_per_env = 16  # [ours: it walks sooner than with 12 or 24]
         max_iterations = 2450  # 321 M steps, five minutes on one H200; it walks within one
         save_interval = 50
 
     class algorithm(LeggedRobotCfgPPO.algorithm):
-        gamma = 0.97  # [P for its own learner; sooner walking than 0.99]
+        gamma = 0.97  # [P for its own learner; it walks sooner than with 0.99]
 
     class anneal(LeggedRobotCfgPPO.anneal):
         entropy_coef = 0.001  # [ours: less noise at the end]
@@ -53,13 +53,13 @@ class Go1FlatCfgPPO(LeggedRobotCfgPPO):
 
 
 class Go1FlatTaskCfgPPO(Go1FlatCfgPPO):
-    """On a CPU this task also changes rewards and commands. In your own task subclass Go1FlatCfgPPO, which does not."""
+    """On a CPU this task also changes rewards and commands. Your own task should extend Go1FlatCfgPPO instead."""
 
     class cpu(Go1FlatCfgPPO.cpu):  # [ours: five of five seeds walk; within 8 minutes on two cores, three; docs/lab.md]
         desired_kl = 0.03
         max_iterations = 1200
         overrides = {
-            "commands.keep_probability": [0.6, 0.25, 0.75],  # else turning on the spot is rare, and learned last
+            "commands.keep_probability": [0.6, 0.25, 0.75],  # otherwise turns on the spot are rare and learned last
             "commands.curriculum": True,
             "commands.curriculum_step": 0.2,
             "perturbation.growth": [0.15, 0.4],  # weak kicks while it learns to walk, then strong ones

@@ -1,4 +1,4 @@
-"""go1_flat without the velocity, which the robot does not measure: 45 values; the critic still sees it."""
+"""go1_flat without the velocity, which the robot does not measure: 45 values; the critic has it."""
 
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot

@@ -1,4 +1,4 @@
-"""Unitree Go1 gets up from any fall and stays standing; randomized worlds."""
+"""Unitree Go1 gets up after any fall and stays standing; randomized worlds."""
 
 from configs.robots.go1 import Go1
 from legged_mw.skills.getup import Getup, GetupCfg, GetupCfgPPO

@@ -1,4 +1,4 @@
-"""Unitree Go1 follows a joystick over slopes, stairs and blocks that it does not see; random worlds, kicks, pushes.
+"""Unitree Go1 follows a joystick over slopes, stairs and blocks, without height scan; random worlds, kicks, pushes.
 
 Sources: [P] MuJoCo Playground's rough task for Go1; [L] legged_gym's terrain and curriculum; [ours] docs/terrain.md.
 """
@@ -18,7 +18,7 @@ class Go1RoughCfg(Go1FlatDrCfg):
         pass
 
     class sim(Go1FlatDrCfg.sim):
-        njmax = 56  # 12 friction, 12 limits, 4 a contact, two contacts a foot
+        njmax = 56  # 12 friction, 12 limits, 4 per contact, two contacts per foot
 
     class rewards(Go1FlatDrCfg.rewards):
         tracking_sigma = 0.25  # [P]
@@ -31,7 +31,7 @@ class Go1RoughCfg(Go1FlatDrCfg):
             feet_clearance = -1.0  # [P -2.0] [ours]
 
     class perturbation(Go1FlatDrCfg.perturbation):
-        curriculum = True  # [ours: weak kicks first, as the ground is hard enough]
+        curriculum = True  # [ours: kicks are weak at first, because the ground is difficult]
 
 
 class Go1RoughCfgPPO(Go1FlatCfgPPO):

@@ -1,4 +1,4 @@
-"""go1_rough with eyes: the policy sees the height of the ground on a grid around it, with noise."""
+"""go1_rough with a height scan: the policy observes the height of the ground on a grid around it, with noise."""
 
 from configs.go1_rough import Go1RoughCfg, Go1RoughCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot

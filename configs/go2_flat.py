@@ -1,4 +1,4 @@
-"""Unitree Go2 follows a joystick on flat ground without knowing its velocity; randomized worlds, kicks and pushes."""
+"""Unitree Go2 follows a joystick on flat ground, without measured velocity; randomized worlds, kicks and pushes."""
 
 from configs.base import SimToRealCfg, SimToRealCfgPPO
 from configs.robots.go2 import WalkingGo2

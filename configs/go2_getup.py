@@ -1,4 +1,4 @@
-"""Unitree Go2 gets up from any fall and stays standing; randomized worlds."""
+"""Unitree Go2 gets up after any fall and stays standing; randomized worlds."""
 
 from configs.robots.go2 import Go2
 from legged_mw.skills.getup import Getup, GetupCfg, GetupCfgPPO

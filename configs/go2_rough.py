@@ -1,4 +1,4 @@
-"""Unitree Go2 follows a joystick over slopes, stairs and blocks that it does not see, without knowing its velocity."""
+"""Unitree Go2 follows a joystick over slopes, stairs and blocks, without height scan and measured velocity."""
 
 from configs.base import SimToRealRoughCfg, SimToRealRoughCfgPPO
 from configs.robots.go2 import WalkingGo2

@@ -1,4 +1,4 @@
-"""go2_rough with eyes: the policy sees the height of the ground on a grid around it, with noise."""
+"""go2_rough with a height scan: the policy observes the height of the ground on a grid around it, with noise."""
 
 from configs.base import SimToRealRoughCfgPPO
 from configs.go2_rough import Go2RoughCfg

@@ -12,12 +12,12 @@ from torch import Tensor
 from legged_mw.envs.observations import Row
 from legged_mw.utils.task import Task
 
-ANKLE = 0.037  # [m] of the ankle, whose height [U] rewards, above the sole, where our foot's site is
+ANKLE = 0.037  # [m] height of the ankle, which [U] rewards, above the sole, where our foot's site is
 
 
 class UnitreeG1(LeggedGymRobot):
     def observation_rows(self) -> dict[str, list[Row | str]]:
-        """Its 47 rows; the clock has a sine and a cosine a foot here, so 49. The critic sees them without noise, and the velocity."""
+        """[U]'s 47 rows, and 2 more of the clock: a sine and a cosine per foot. The critic gets no noise, and the velocity."""
         rows = {row.name: row for row in super().observation_rows()["state"] if isinstance(row, Row)}
         velocity, clock = (
             rows.pop("base_lin_vel"),
@@ -30,15 +30,15 @@ class UnitreeG1(LeggedGymRobot):
         }
 
     def _reward_contact(self) -> Tensor:
-        """How many feet stand or swing as the clock wants."""
+        """Number of feet that stand or swing by the clock."""
         return 2.0 * self._reward_contact_phase()
 
     def _reward_contact_no_vel(self) -> Tensor:
-        """Squared velocity of feet that stand [m^2/s^2]."""
+        """Squared velocity of stance feet [m^2/s^2]."""
         return (self.foot_vel.square().sum(dim=2) * self.foot_contact).sum(dim=1)
 
     def _reward_feet_swing_height(self) -> Tensor:
-        """Squared distance of swinging ankles from 0.08 m above the ground [m^2]."""
+        """Squared height error of swinging ankles from 0.08 m above the ground [m^2]."""
         return ((self.foot_height + ANKLE - 0.08).square() * ~self.foot_contact).sum(dim=1)
 
 
@@ -48,7 +48,7 @@ class G1UnitreeCfg(Go1LeggedGymCfg):
         imu_site = "imu_in_pelvis"
         foot_names = ["left_foot", "right_foot"]
         foot_geoms = {"left_foot": ["left_foot[26]_collision"], "right_foot": ["right_foot[26]_collision"]}
-        colliders = ["*_foot[26]_collision"]  # [U]: all bodies; its rewards count no contact but the feet's
+        colliders = ["*_foot[26]_collision"]  # [U]: all bodies; its rewards count only contacts of the feet
         held_joints = ["waist_*", "*_shoulder_*", "*_elbow_*", "*_wrist_*"]
         penalize_contacts_on = []
         terminate_after_contacts_on = []

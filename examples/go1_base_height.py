@@ -1,4 +1,4 @@
-"""Go1 on flat ground that also takes the height of its base as a command: how to add a command of your own."""
+"""Go1 on flat ground with the height of its base as a command: an example of your own command."""
 
 import torch
 
@@ -9,7 +9,7 @@ from legged_mw.utils.task import Task
 
 class CrouchingRobot(LeggedRobot):
     def _reward_tracking_base_height(self) -> torch.Tensor:
-        """The root as high above the ground as commanded, within some 2 cm."""
+        """Tracks the commanded height of the root above the ground, within about 2 cm."""
         return torch.exp(-((self.base_height - self.commands[:, 3]) / 0.02).square())
 
 
@@ -23,7 +23,7 @@ class Go1BaseHeightCfg(Go1FlatCfg):
     class rewards(Go1FlatCfg.rewards):
         class scales(Go1FlatCfg.rewards.scales):
             tracking_base_height = 1.0
-            pose, stand_still = 0.1, -0.1  # the default pose is one height of many
+            pose, stand_still = 0.1, -0.1  # the default pose has only one of the heights
 
 
 TASK = Task(CrouchingRobot, Go1BaseHeightCfg, Go1FlatCfgPPO)

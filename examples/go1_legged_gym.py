@@ -17,29 +17,29 @@ from legged_mw.utils.task import Task
 
 
 class LeggedGymRobot(LeggedRobot):
-    """What legged_gym's robot does and LeggedRobot does not, or does in another way."""
+    """The parts of legged_gym's robot that LeggedRobot lacks or computes differently."""
 
     cfg: Go1LeggedGymCfg
 
     # ---- commands
 
     def _draw_timers(self) -> Tensor:
-        """Always ``resampling_time``. [L]"""
+        """The constant ``resampling_time``. [L]"""
         return torch.full_like(self.command_timer, self.cfg.commands.resampling_time / self.dt)
 
     def _reset_commands(self, mask: Tensor) -> None:
-        """Uniform; velocities too small to walk at become zero. [L]"""
+        """Uniform commands; velocities too small for walking are set to zero. [L]"""
         super()._reset_commands(mask)
         small = torch.linalg.vector_norm(self.commands[:, :2], dim=1) <= self.cfg.commands.min_lin_vel
         self.commands[:, :2].masked_fill_((small & mask)[:, None], 0.0)
 
     def _resample_commands(self, mask: Tensor) -> None:
-        self._reset_commands(mask)  # legged_gym redraws all of a command, LeggedRobot some of it
+        self._reset_commands(mask)  # legged_gym redraws the whole command, LeggedRobot a part of it
 
     # ---- observations
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
-        """One group: legged_gym's actor and critic see the same."""
+        """One group: legged_gym's actor and critic have the same observations."""
         noise, scale = self.cfg.noise.scales, self.cfg.normalization.obs_scales
         velocities = (scale.lin_vel, scale.lin_vel, scale.ang_vel)
         return {
@@ -64,7 +64,7 @@ class LeggedGymRobot(LeggedRobot):
             ]
         }
 
-    # ---- rewards: those that LeggedRobot lacks, or computes in another way. All [L].
+    # ---- rewards that LeggedRobot lacks or computes differently. All [L].
 
     def _reward_lin_vel_z(self) -> Tensor:
         """Square of the vertical velocity, body frame."""
@@ -75,7 +75,7 @@ class LeggedGymRobot(LeggedRobot):
         return self.base_ang_vel[:, :2].square().sum(dim=1)
 
     def _reward_feet_air_time(self) -> Tensor:
-        """At touch-down, how much longer than ``min_air_time`` the foot was in the air [s], unless commanded to stand or turn."""
+        """At touch-down, the foot's air time beyond ``min_air_time`` [s], unless commanded to stand or turn."""
         excess = (self.feet_air_time - self.cfg.rewards.min_air_time) * self.first_contact
         walking = torch.linalg.vector_norm(self.commands[:, :2], dim=1) > 0.1
         return excess.sum(dim=1) * walking
@@ -128,7 +128,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
             heading = [-3.14, 3.14]  # [rad]
 
     class termination(LeggedRobotCfg.termination):
-        max_tilt = 180.0  # none: only a contact of the trunk is a fall
+        max_tilt = 180.0  # no limit: only a contact of the trunk is a fall
 
     class rewards(LeggedRobotCfg.rewards):
         soft_dof_pos_limit = 0.9
@@ -155,7 +155,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
             dof_vel = 0.0
             stand_still = 0.0
             termination = 0.0
-            # LeggedRobotCfg's own, which legged_gym does not have
+            # fields of LeggedRobotCfg that legged_gym does not have
             pose = 0.0
             energy = 0.0
             feet_clearance = 0.0
@@ -189,7 +189,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
     class domain_rand(LeggedRobotCfg.domain_rand):
         enable = True
         friction = [0.5, 1.25]
-        # legged_gym's masses stay as they are, and it has none of these
+        # legged_gym does not randomize these
         base_mass = []
         link_mass = []
         base_com = []
@@ -202,8 +202,8 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
 
     class sim(LeggedRobotCfg.sim):
         dt = 0.005
-        nconmax = 24  # whatever collides, not the feet alone: 14 were the most seen of robots that thrash
-        njmax = 120  # 24 of the joints, 4 a contact
+        nconmax = 24  # all geoms collide, not only the feet: at most 14 were measured for robots that thrash
+        njmax = 120  # 24 of the joints, 4 per contact
 
 
 class Go1LeggedGymCfgPPO(LeggedRobotCfgPPO):
@@ -216,7 +216,7 @@ class Go1LeggedGymCfgPPO(LeggedRobotCfgPPO):
         critic = ["state"]
 
     class actor(LeggedRobotCfgPPO.actor):
-        obs_normalization = False  # obs_scales do it
+        obs_normalization = False  # obs_scales replace it
 
         class distribution_cfg(LeggedRobotCfgPPO.actor.distribution_cfg):
             init_std = 1.0

@@ -26,7 +26,7 @@ class MjlabRobot(LeggedRobot):
         return torch.empty(self.num_envs, 1, device=self.device).uniform_(low, high).round_()
 
     def _reset_commands(self, mask: Tensor) -> None:
-        """Uniform; a tenth of the robots is told to stand."""
+        """Uniform commands; a tenth of the robots gets the command to stand."""
         super()._reset_commands(mask)
         stands = torch.rand(self.num_envs, device=self.device) < self.cfg.commands.standing_share
         self.commands.masked_fill_((stands & mask)[:, None], 0.0)
@@ -34,12 +34,12 @@ class MjlabRobot(LeggedRobot):
     def _resample_commands(self, mask: Tensor) -> None:
         self._reset_commands(mask)
 
-    # ---- rewards: a term of mjlab is a function with parameters, here a method
+    # ---- rewards: a term of mjlab is a function with parameters; here it is a method
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
         calf = torch.tensor(["calf" in name for name in self.robot.joint_names], device=self.device)
-        self.joint_std = torch.where(calf, 2.0, 1.0)  # (D,) the calf may deviate twice as far
+        self.joint_std = torch.where(calf, 2.0, 1.0)  # (D,) the calf may deviate twice as much
 
     def _reward_tracking_lin_vel(self) -> Tensor:
         """track_linear_velocity: std^2 0.25, and no vertical velocity."""
@@ -61,7 +61,7 @@ class MjlabRobot(LeggedRobot):
         return torch.exp(-(self.dof_offset / std).square().mean(dim=1))
 
     def _reward_feet_clearance(self) -> Tensor:
-        """feet_clearance: the speed itself where Playground has its root, while moving [m^2/s]."""
+        """feet_clearance: the speed itself, of which Playground takes the root, while moving [m^2/s]."""
         off = (self.foot_height - self.cfg.rewards.swing_height).abs() * self.foot_speed
         return (off * self.moving[:, None]).sum(dim=1)
 
@@ -141,7 +141,7 @@ class Go1MjlabCfgPPO(Go1FlatCfgPPO):
         gamma, entropy_coef = 0.99, 0.01
 
     class anneal(Go1FlatCfgPPO.anneal):
-        entropy_coef = desired_kl = 0.0  # they stay
+        entropy_coef = desired_kl = 0.0  # both stay
 
     class symmetry(Go1FlatCfgPPO.symmetry):
         use_data_augmentation = False

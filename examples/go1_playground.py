@@ -15,7 +15,7 @@ class Go1PlaygroundCfg(Go1FlatCfg):
 
     class rewards(Go1FlatCfg.rewards):
         tracking_sigma = 0.25
-        clip_termination = True  # a fall is inside of the clip at 0
+        clip_termination = True  # a fall is inside the clip at 0
 
         class scales(Go1FlatCfg.rewards.scales):
             tracking_lin_vel = 1.0
@@ -45,7 +45,7 @@ class Go1PlaygroundCfgPPO(Go1FlatCfgPPO):
         schedule = "fixed"
 
     class anneal(Go1FlatCfgPPO.anneal):
-        entropy_coef = 0.0  # stays
+        entropy_coef = 0.0  # it stays
         desired_kl = 0.0
 
     class symmetry(Go1FlatCfgPPO.symmetry):

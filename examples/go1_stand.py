@@ -1,4 +1,4 @@
-"""Go1 holds its default pose against kicks: a task without commands, and without feet."""
+"""Go1 holds its default pose against kicks: a task without commands and feet."""
 
 from configs.robots.go1 import Go1
 from legged_mw.envs.robot_task import RobotTask

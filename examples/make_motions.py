@@ -3,9 +3,9 @@
     python examples/make_motions.py [FOLDER]         # resources/motions, if no folder is given
     python -m legged_mw.motion resources/motions/g1_kick.npz --sheet kick.png
 
-A clip says where the feet are, where the ground pushes (the zero moment point) and how waist, arms and pelvis are held. The centre
-of mass follows from where the ground pushes, as of an inverted pendulum: z'' = g / h (z - p). Root and legs follow from feet, centre
-of mass and pelvis, frame by frame, by damped least squares.
+A clip gives the poses of the feet, the zero moment point, and the poses of waist, arms and pelvis. The centre of mass
+follows from the zero moment point p by the model of an inverted pendulum: z'' = g / h (z - p). Root and legs follow
+from feet, centre of mass and pelvis in each frame, by damped least squares.
 """
 
 from __future__ import annotations
@@ -34,31 +34,31 @@ from legged_mw.utils.task import load_task
 
 RATE, GRAVITY = 50.0, 9.81  # [1/s], [m/s^2]
 SIDES = ("left", "right")
-ANKLE = 0.035  # [m] of an ankle above the ground with its sole flat on it
-SOLE = 0.035  # [m] from an ankle ahead to the middle of its sole
-SWING = 0.07  # [m] that a stepping foot is lifted
-STEP, DOUBLE = 0.8, 0.35  # [s] a step; the share of it with both feet on the ground
-ARMS = {"shoulder_pitch": 0.2, "shoulder_roll": 0.2, "elbow": 0.8}  # [rad] as the default pose has them
+ANKLE = 0.035  # [m] height of an ankle above the ground, with a flat sole
+SOLE = 0.035  # [m] from an ankle ahead to the centre of its sole
+SWING = 0.07  # [m] height of a foot at mid swing
+STEP, DOUBLE = 0.8, 0.35  # [s] duration of a step; share of it with both feet on the ground
+ARMS = {"shoulder_pitch": 0.2, "shoulder_roll": 0.2, "elbow": 0.8}  # [rad] the default pose
 
 
 @dataclass
 class Plan:
-    """What a clip asks for over T frames; ``keyed`` makes such rows from a few numbers."""
+    """The targets of a clip over T frames. ``keyed`` makes such arrays from a few numbers."""
 
     seconds: float
-    # of each side (T, 4): the ankle's place [m], the foot's heading [rad]
+    # for each side (T, 4): position of the ankle [m], heading of the foot [rad]
     feet: list[Floats] = field(default_factory=list)
-    push: Floats = field(default_factory=lambda: np.zeros(0))  # (T, 2) where the ground pushes [m]
-    height: Floats = field(default_factory=lambda: np.zeros(0))  # (T,) of the pelvis [m]
+    push: Floats = field(default_factory=lambda: np.zeros(0))  # (T, 2) zero moment point [m]
+    height: Floats = field(default_factory=lambda: np.zeros(0))  # (T,) height of the pelvis [m]
     tilt: Floats = field(default_factory=lambda: np.zeros(0))  # (T, 3) roll, pitch, heading of the pelvis [rad]
-    # of waist and arms (T,) [rad]; others as in the default pose
+    # joints of waist and arms (T,) [rad]; the others are in the default pose
     joints: dict[str, Floats] = field(default_factory=dict)
-    raised: Floats | None = None  # (T,) how far the right leg is by `leg`, not by its foot, from 0 to 1
-    leg: dict[str, Floats] = field(default_factory=dict)  # of the right leg (T,) [rad]
+    raised: Floats | None = None  # (T,) weight of the angles `leg` of the right leg, 0 to 1; 0: by its foot
+    leg: dict[str, Floats] = field(default_factory=dict)  # joints of the right leg (T,) [rad]
 
 
 def keyed(seconds: float, keys: Mapping[float, float | Sequence[float]]) -> Floats:
-    """Time [s] -> value, at every frame; between two times without speed or acceleration at either end."""
+    """Interpolate time [s] -> value at every frame. Speed and acceleration are zero at the given times."""
     now, times = np.arange(round(seconds * RATE) + 1) / RATE, np.array(list(keys), dtype=float)
     values = np.array(list(keys.values()), dtype=float)
     part = np.clip(np.searchsorted(times, now, side="right") - 1, 0, len(times) - 2)
@@ -68,12 +68,12 @@ def keyed(seconds: float, keys: Mapping[float, float | Sequence[float]]) -> Floa
 
 
 def smooth(share: Floats) -> Floats:
-    """From 0 to 1 as ``share`` goes, without speed or acceleration at either end."""
+    """A polynomial from 0 to 1 for ``share`` from 0 to 1. Speed and acceleration are zero at both ends."""
     return share**3 * (10 - 15 * share + 6 * share**2)
 
 
 class Body:
-    """The robot, posed frame by frame."""
+    """The robot's model, posed frame by frame."""
 
     def __init__(self) -> None:
         self.model = mujoco.MjModel.from_xml_path(str(ROOT / G1.asset.file))
@@ -85,17 +85,17 @@ class Body:
         self.ankles = [self.model.body(f"{side}_ankle_roll_link").id for side in SIDES]
         self.pelvis = self.model.body("pelvis").id
         legs = [self.names.index(name) for name in self.names if any(part in name for part in ("hip", "knee", "ankle"))]
-        self.legs = np.array(legs)  # of the joints; the left leg's six first
+        self.legs = np.array(legs)  # indices of the joints; first the six of the left leg
         self.data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *self.default]
         mujoco.mj_forward(self.model, self.data)
-        self.standing = ANKLE - float(self.data.xpos[self.ankles[0], 2])  # [m] of the pelvis
+        self.standing = ANKLE - float(self.data.xpos[self.ankles[0], 2])  # [m] height of the pelvis in the default pose
         self.data.qpos[2] = self.standing
         mujoco.mj_forward(self.model, self.data)
-        self.stance = [float(self.data.xpos[ankle, 1]) for ankle in self.ankles]  # [m] to the left, of each ankle
+        self.stance = [float(self.data.xpos[ankle, 1]) for ankle in self.ankles]  # [m] of each ankle, to the left
         self.com_height = float(self.data.subtree_com[0, 2])
 
     def pose(self, plan: Plan) -> Clip:
-        """The clip that ``plan`` asks for."""
+        """The clip with the targets of ``plan``."""
         com = swayed(plan.push, self.com_height)
         if plan.raised is None:
             return self._solve(plan, com, None)
@@ -107,7 +107,7 @@ class Body:
         return self._solve(plan, com, own)
 
     def _solve(self, plan: Plan, com: Floats, leg: Floats | None) -> Clip:
-        """``leg`` (T, D): where it is given, the right leg is at these angles while it is raised."""
+        """Inverse kinematics of all frames. ``leg`` (T, D): angles [rad] of the right leg while it is raised."""
         frames, data = [], self.data
         data.qpos[:] = [0.0, 0.0, self.standing, 1.0, 0.0, 0.0, 0.0, *self.default]
         for t in range(len(plan.push)):
@@ -132,7 +132,7 @@ class Body:
         return checked(Path("clip"), RATE, self.names, path[:, :3], path[:, 3:7], path[:, 7:])
 
     def _off(self, plan: Plan, com: Floats, t: int, feet: int) -> tuple[Floats, Floats]:
-        """What is missing of the wanted pose, and what it changes by: feet, centre of mass, pelvis."""
+        """Error and Jacobian of the targets of frame ``t``: ankles, centre of mass, pelvis."""
         model, data = self.model, self.data
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -149,13 +149,13 @@ class Body:
 
 
 def _between(q: Floats, wanted: Sequence[float] | Floats) -> Floats:
-    """Rotation vector (3,) [rad, world] from ``q`` to roll, pitch, heading."""
+    """Rotation vector (3,) [rad, world] from the attitude ``q`` to roll, pitch, heading ``wanted``."""
     roll, pitch, heading = (from_rotation_vector(np.eye(3)[i] * float(wanted[i])) for i in range(3))
     return rotation_vector(multiply(multiply(heading, multiply(pitch, roll)), conjugate(q)))
 
 
 def swayed(push: Floats, height: float) -> Floats:
-    """Places (T, 2) of the centre of mass of a pendulum that is pushed at ``push``; at rest at both ends."""
+    """Positions (T, 2) [m] of the centre of mass with the zero moment point ``push``, at rest at both ends."""
     count, stiff = len(push), height / GRAVITY * RATE**2
     matrix = (
         np.diag(np.full(count, 1.0 + 2.0 * stiff))
@@ -167,7 +167,7 @@ def swayed(push: Floats, height: float) -> Floats:
 
 
 def stand(body: Body, seconds: float) -> Plan:
-    """Both feet side by side, the weight in the middle."""
+    """Both feet are side by side, and the weight is between them."""
     count = round(seconds * RATE) + 1
     feet = [np.tile([0.0, y, ANKLE, 0.0], (count, 1)) for y in body.stance]
     middle = np.tile([SOLE, 0.0], (count, 1))
@@ -175,7 +175,7 @@ def stand(body: Body, seconds: float) -> Plan:
 
 
 def squat(body: Body) -> Plan:
-    """Down and up, twice, arms ahead."""
+    """The robot squats twice, with its arms ahead."""
     plan = stand(body, 6.0)
     down = keyed(6.0, {0.5: 0.0, 1.7: 1.0, 2.1: 1.0, 3.2: 0.0, 3.4: 0.0, 4.3: 1.0, 4.5: 1.0, 5.4: 0.0, 6.0: 0.0})
     plan.height = body.standing - 0.27 * down
@@ -187,7 +187,7 @@ def squat(body: Body) -> Plan:
 
 
 def step(plan: Plan, body: Body, start: float, headings: Sequence[float], first: int) -> None:
-    """From ``start`` [s] on a step for each of ``headings`` [rad], left and right in turn; the feet stay on a circle."""
+    """Add a step from ``start`` [s] on for each of ``headings`` [rad], alternating sides; the feet stay on a circle."""
     now, heading = np.arange(len(plan.push)) / RATE, [0.0, 0.0]
     pushes: dict[float, Sequence[float]] = {0.0: (SOLE, 0.0), start: (SOLE, 0.0)}
     for number, wanted in enumerate(headings):
@@ -206,19 +206,19 @@ def step(plan: Plan, body: Body, start: float, headings: Sequence[float], first:
     middle = np.mean([_sole(body, side, heading[side]) for side in (0, 1)], axis=0)
     pushes[end + DOUBLE * STEP] = pushes[plan.seconds] = middle
     plan.push = keyed(plan.seconds, pushes)
-    # else a leg is too short
+    # otherwise a leg is too short
     plan.height = body.standing - keyed(plan.seconds, {0.0: 0.0, start: 0.03, end: 0.03, plan.seconds: 0.0})
     plan.tilt[:, 2] = keyed(plan.seconds, {0.0: 0.0, start: 0.0, end: heading[0], plan.seconds: heading[0]})
 
 
 def _sole(body: Body, side: int, heading: float) -> tuple[float, float]:
-    """The middle of a sole (2,) [m]."""
+    """The centre of a sole (2,) [m]."""
     y = body.stance[side]
     return SOLE * np.cos(heading) - y * np.sin(heading), SOLE * np.sin(heading) + y * np.cos(heading)
 
 
 def wave(body: Body) -> Plan:
-    """Steps in place; the right arm is raised and waves."""
+    """The robot steps in place, and its raised right arm waves."""
     plan = stand(body, 6.6)
     step(plan, body, 0.6, [0.0] * 6, first=0)
     up = keyed(6.6, {0.4: 0.0, 1.4: 1.0, 5.0: 1.0, 6.0: 0.0, 6.6: 0.0})
@@ -233,7 +233,7 @@ def wave(body: Body) -> Plan:
 
 
 def kick(body: Body) -> Plan:
-    """The weight goes to the left foot; the right leg is drawn up, kicks to the side, is held there, and comes back."""
+    """The weight moves to the left foot. The right leg is raised, kicks to the side, is held there, and comes down."""
     plan, left = stand(body, 7.0), body.stance[0]
     plan.push = keyed(
         7.0,
@@ -260,7 +260,7 @@ def kick(body: Body) -> Plan:
 
 
 def turn(body: Body) -> Plan:
-    """Half a turn to the left in eight steps; the arms swing a little."""
+    """The robot turns left by half a turn in eight steps, with a small arm swing."""
     plan = stand(body, 8.0)
     quarter = np.pi / 4
     step(plan, body, 0.6, [quarter * (number // 2 + 1) for number in range(8)], first=0)
@@ -268,7 +268,7 @@ def turn(body: Body) -> Plan:
     swing = going * np.sin(np.pi / STEP * (np.arange(len(plan.push)) / RATE - 0.6))
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         plan.joints[f"{side}_shoulder_pitch_joint"] = ARMS["shoulder_pitch"] + sign * 0.2 * swing
-        # hands clear of the thighs
+        # keeps the hands away from the thighs
         plan.joints[f"{side}_shoulder_roll_joint"] = sign * (ARMS["shoulder_roll"] + 0.15 * going)
     return plan
 

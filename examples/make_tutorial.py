@@ -1,11 +1,11 @@
-"""Makes the tutorial's notebooks from its pages, docs/tutorial.md and docs/zh/tutorial.md, and with --run what they show.
+"""Make the tutorial's notebooks from its pages, docs/tutorial.md and docs/zh/tutorial.md. With --run, run the cells.
 
-    python examples/make_tutorial.py          # notebooks from pages; the code of the English page is that of the Chinese one too
-    python examples/make_tutorial.py --run    # run it first; write what cells print and draw into both pages
-    python examples/make_tutorial.py --quick  # the same, but cells that train keep what they show
+    python examples/make_tutorial.py          # notebooks from pages; both pages have the code of the English one
+    python examples/make_tutorial.py --run    # also run the cells, and write their outputs into both pages
+    python examples/make_tutorial.py --quick  # the same, but cells that train keep their outputs
 
-In a page a block of ```python is a cell. A block of ```text right after it is what the cell prints, and a picture after that is what it
-draws: those are left out of the notebook. Needs nbclient and ipykernel, of the extra `dev`.
+In a page a block of ```python is a cell. A block of ```text after it is the printed output, and a picture after that is
+the drawn output. Notebooks have no outputs. Needs nbclient and ipykernel, of the extra `dev`.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ CELL = re.compile(
     r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?(?:\n!\[[^\]]*\]\((?:\.\./)?(images/tutorial/[^)]*)\)\n)?",
     re.DOTALL,
 )
-COLORS, QUALITY = 16, 75  # of a plot; of a photo
+COLORS, QUALITY = 16, 75  # colours of a plot; quality of a photo
 
 
 def notebook(page: str) -> dict[str, Any]:
-    """The notebook of a page's text, without outputs."""
+    """The notebook of a page, without outputs."""
     cells, end = [], 0
     for cell in CELL.finditer(page):
         cells += [_markdown(page[end : cell.start()]), _cell("code", cell[1])]
@@ -48,7 +48,7 @@ def notebook(page: str) -> dict[str, Any]:
 
 
 def _markdown(text: str) -> dict[str, Any]:
-    """A cell of text; links to other pages lead out of examples/."""
+    """A text cell. Links to other pages start in examples/."""
     return _cell(
         "markdown", re.sub(r"\]\((?:\.\./)*([\w/.]+\.(?:md|ipynb))", lambda link: f"]({_from_examples(link[1])}", text)
     )
@@ -72,7 +72,7 @@ def as_json(cells: dict[str, Any]) -> str:
 
 
 def translated(page: str, original: str) -> str:
-    """``page`` with the code and the outputs of ``original``, cell by cell."""
+    """``page`` with the code and the outputs of ``original``."""
     theirs = iter(list(CELL.finditer(original)))
     if len(CELL.findall(page)) != len(CELL.findall(original)):
         raise SystemExit("the two pages have different numbers of ```python blocks")
@@ -80,7 +80,7 @@ def translated(page: str, original: str) -> str:
 
 
 def _written(cell: re.Match[str], code: str, printed: str) -> str:
-    """The cell as it stands in a page, with new code and output; its picture's line stays."""
+    """A cell as page text, with new code and output. The line of its picture stays."""
     picture = re.search(r"\n!\[.*\n", cell[0])
     return (
         f"```python\n{code}```\n" + (f"\n```text\n{printed}```\n" if printed else "") + (picture[0] if picture else "")
@@ -88,13 +88,13 @@ def _written(cell: re.Match[str], code: str, printed: str) -> str:
 
 
 def run(cells: dict[str, Any], folder: Path = ROOT / "examples") -> list[dict[str, Any]]:
-    """Run a notebook in ``folder``; returns its code cells with their outputs. Raises at the first that fails."""
+    """Run a notebook in ``folder``. Returns its code cells with outputs. Raises the error of the first that fails."""
     import nbformat
     from nbclient import NotebookClient
 
     node = nbformat.reads(as_json(cells), as_version=4)
     with TemporaryDirectory() as path:
-        # this checkout's, and not configs/, which a reader's kernel lacks too
+        # this checkout's modules, but not configs/, which a reader's kernel does not have
         (Path(path) / "legged_mw").symlink_to(ROOT / "legged_mw")
         kernel = {**os.environ, "PYTHONPATH": path, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
         NotebookClient(node, timeout=3600, resources={"metadata": {"path": str(folder)}}).execute(env=kernel)
@@ -102,14 +102,14 @@ def run(cells: dict[str, Any], folder: Path = ROOT / "examples") -> list[dict[st
 
 
 def printed(cell: dict[str, Any]) -> str:
-    """What a cell printed."""
+    """The printed output of a cell."""
     return "".join(
         output["text"] for output in cell["outputs"] if output["output_type"] == "stream" and output["name"] == "stdout"
     )
 
 
 def _with_outputs(page: str, ran: list[dict[str, Any]], quick: bool) -> str:
-    """The page with what its cells printed; their pictures go to the files that it names. ``quick``: not those of cells that train."""
+    """The page with outputs of the cells ``ran``, and save pictures. ``quick``: cells that train keep their outputs."""
     cells = iter(ran)
 
     def write(cell: re.Match[str]) -> str:
@@ -128,7 +128,7 @@ def _with_outputs(page: str, ran: list[dict[str, Any]], quick: bool) -> str:
 
 
 def _save(png: bytes, path: Path) -> None:
-    """A small WebP file of it: of a plot, which is mostly white, with few colours and without loss."""
+    """Save a small WebP file. A plot is mostly white, so it gets few colours and no loss."""
     from PIL import Image
 
     picture = Image.open(io.BytesIO(png)).convert("RGB")

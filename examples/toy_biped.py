@@ -1,4 +1,4 @@
-"""A made-up biped with three joints a leg and feet of two boxes: a robot of one's own, that does not see its joint angles."""
+"""An invented biped with three joints per leg and feet of two boxes, as an example. It observes no joint angles."""
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg

@@ -1,11 +1,12 @@
-"""A robot at the other end of a network link: an example of the seam ``Robot``, with its own server.
+"""A robot with a network link: an example of a ``Robot`` with its own server.
 
     python examples/udp_robot.py resources/policies/go1_flat --serve 127.0.0.1:9870                     # one terminal
     python examples/udp_robot.py resources/policies/go1_flat --drive 127.0.0.1:9870 --command 0.8,0,0   # another
 
-Packets are little-endian: a header, then float64 values. Both ends read the same export: the header's digest shows whether they did.
-A packet that is malformed, late, not finite or from somebody else is counted and dropped; only new targets keep the servos on.
-Use it on one machine, or on a cable between two: nothing is encrypted, and anybody who can send to the port moves the robot.
+Packets are little-endian: a header, then float64 values. Both ends read the same export; the header has its digest.
+A packet that is malformed, late, not finite or from another sender is counted and dropped. Only new targets keep the
+servos on. Use it on one machine or on a direct cable: nothing is encrypted, and anyone who can send to the port can
+move the robot.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ from legged_mw.utils.errors import UserError, printable
 from legged_mw.view.drive import parse_command
 
 VERSION = 1
-HELLO, MEASURED, TARGETS, CLOSE, REFUSED = range(1, 6)  # kinds of packet
-# "LMWR", version, kind, digest of the contract's layout, count of TARGETS sent so far
+HELLO, MEASURED, TARGETS, CLOSE, REFUSED = range(1, 6)  # types of packets
+# "LMWR", version, type, digest of the contract, number of sent TARGETS
 _HEADER = struct.Struct("<4sBB8sI")
-_MAGIC, _MOST = b"LMWR", 65507  # bytes that fit into one packet
-_FAR = 1e4  # [rad] or [N m]: a target beyond it is none
+_MAGIC, _MOST = b"LMWR", 65507  # magic bytes; [byte] largest packet
+_FAR = 1e4  # [rad] or [N m] limit of a valid target
 
 
 class Packet(NamedTuple):
-    """One packet, taken apart."""
+    """The fields of a packet."""
 
     kind: int
     digest: bytes
@@ -53,18 +54,18 @@ class Packet(NamedTuple):
 
 
 def contract_digest(contract: Contract) -> bytes:
-    """Eight bytes that differ where joints, their order, a measurement's layout or the period differ."""
+    """Eight bytes that depend on joints, their order, the measurement's layout and the period."""
     said = [list(contract.joints), list(contract.feet), layout(contract), contract.period]
     return hashlib.sha256(json.dumps(said).encode()).digest()[:8]
 
 
 def pack(kind: int, digest: bytes, count: int, body: bytes = b"") -> bytes:
-    """The bytes of a packet."""
+    """Encode a packet."""
     return _HEADER.pack(_MAGIC, VERSION, kind, digest, count) + body
 
 
 def unpack(data: bytes) -> Packet | None:
-    """A packet from its bytes; None if they are not a packet of this link. Raises RobotError for another version."""
+    """Decode a packet; None if it is not a packet of this link. Raises RobotError for another version."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return None
     _, version, kind, digest, count = _HEADER.unpack_from(data)
@@ -79,7 +80,7 @@ def numbers(body: bytes, count: int) -> Floats | None:
 
 
 def counted(dropped: Counter[str]) -> str:
-    """What was dropped, in words to end a line with; nothing if nothing was."""
+    """Text on the dropped packets, for the end of a line; empty if there are none."""
     return (
         f" ({sum(dropped.values())} packets dropped: {', '.join(f'{n} {why}' for why, n in dropped.items())})"
         if dropped
@@ -88,7 +89,7 @@ def counted(dropped: Counter[str]) -> str:
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """ "HOST:PORT" as what a socket wants."""
+    """Parse "HOST:PORT" to a socket address."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or not 0 < int(port) < 65536:
         raise UserError(f"'{text}' is no address; write HOST:PORT, e.g. 127.0.0.1:9870")
@@ -96,10 +97,10 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 class UdpRobot(Robot):
-    """The robot that a server at ``address`` owns. The server answers each packet with a measurement; no answer, no step."""
+    """A robot that a server at ``address`` controls. The server answers each packet with a measurement."""
 
     def __init__(self, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
-        """Send a hello and take the first measurement; raises RobotError if no answer comes within ``timeout`` [s]."""
+        """Send a hello and receive the first measurement. Raises RobotError after ``timeout`` [s] without an answer."""
         self._layout, self._digest, self._name = (
             layout(contract),
             contract_digest(contract),
@@ -107,7 +108,7 @@ class UdpRobot(Robot):
         )
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._count, self._timeout, self._open = 0, timeout, True
-        self.dropped: Counter[str] = Counter()  # packets that were no answer, by why
+        self.dropped: Counter[str] = Counter()  # reason -> number of packets that were not an answer
         try:
             self._socket.connect(address)
         except OSError as error:
@@ -124,12 +125,12 @@ class UdpRobot(Robot):
     def close(self) -> None:
         if self._open:
             self._open = False
-            with contextlib.suppress(OSError):  # if the server hears nothing more, it switches the servos off by itself
+            with contextlib.suppress(OSError):  # without packets the server switches the servos off
                 self._socket.send(pack(CLOSE, self._digest, self._count))
             self._socket.close()
 
     def _exchange(self, kind: int, body: bytes = b"") -> Measurement:
-        """Send a packet and take its answer; what else comes meanwhile is counted, and does not lengthen the wait."""
+        """Send a packet and receive its answer. Other packets are counted and do not extend the timeout."""
         end = time.monotonic() + self._timeout
         try:
             self._socket.send(pack(kind, self._digest, self._count, body))
@@ -163,7 +164,7 @@ class UdpRobot(Robot):
         )
 
     def _measurement(self, body: bytes) -> Measurement:
-        # what is not finite, or cannot be, is for the limits of ``safety``
+        # the limits of ``safety`` check the values
         values = np.frombuffer(body, dtype="<f8").astype(float)
         parts = dict(zip(self._layout, np.split(values, np.cumsum(list(self._layout.values()))[:-1]), strict=True))
         return Measurement(
@@ -172,10 +173,10 @@ class UdpRobot(Robot):
 
 
 class UdpServer:
-    """Owns ``robot`` and obeys one client. When that client closes or sends no new targets for too long, the servos are switched off."""
+    """Controls ``robot`` for one client. If the client closes or sends no new targets, the servos are switched off."""
 
     def __init__(self, robot: Robot, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
-        """Listen at ``address`` (port 0: any free one); ``timeout`` [s] is the longest time between two targets of the client."""
+        """Listen at ``address`` (port 0: any free port). ``timeout`` [s]: longest time between two targets."""
         self._robot, self._contract, self._timeout = robot, contract, timeout
         self._layout, self._digest, self._count = layout(contract), contract_digest(contract), 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -185,10 +186,10 @@ class UdpServer:
             self._socket.close()
             raise UserError(f"cannot listen at {address[0]}:{address[1]}: {error.strerror or error}") from None
         self.address: tuple[str, int] = self._socket.getsockname()
-        self.dropped: Counter[str] = Counter()  # packets that moved nothing, by why
+        self.dropped: Counter[str] = Counter()  # reason -> number of packets without effect
 
     def serve(self, say: Callable[[str], None] = print) -> str:
-        """Serve one client from its hello until it closes or falls silent, then close the robot. Returns why it ended."""
+        """Serve one client from its hello until it closes or times out, then close the robot. Returns the reason."""
         why = "interrupted"
         try:
             client = self._wait_for_client(say)
@@ -200,7 +201,7 @@ class UdpServer:
         return why
 
     def _wait_for_client(self, say: Callable[[str], None]) -> tuple[str, int]:
-        """The first client that sends a hello with the same contract, and can be answered."""
+        """Wait for the first client that sends a hello with the same contract and can be answered."""
         while True:
             data, sender = self._hear(None)
             packet = self._packet(data, sender)
@@ -211,7 +212,7 @@ class UdpServer:
                 return sender
 
     def _obey(self, client: tuple[str, int]) -> str:
-        """Obey ``client`` alone until it closes or sends no new targets; returns which."""
+        """Accept only ``client`` until it closes or sends no new targets. Returns the reason."""
         heard = time.monotonic()
         while (left := heard + self._timeout - time.monotonic()) > 0:
             try:
@@ -226,7 +227,7 @@ class UdpServer:
                 if packet.kind == HELLO or self._move(packet, client):
                     heard = time.monotonic() if packet.kind == TARGETS else heard
                     self._send(self._measured(), client)
-        return f"{client[0]}:{client[1]} fell silent for {self._timeout:g} s"
+        return f"{client[0]}:{client[1]} sent nothing for {self._timeout:g} s"
 
     def _move(self, packet: Packet, client: tuple[str, int]) -> bool:
         """Whether these targets are new and were written."""
@@ -247,11 +248,11 @@ class UdpServer:
         """The next packet and its sender, within ``seconds``. Raises TimeoutError."""
         self._socket.settimeout(seconds)
         while True:
-            with contextlib.suppress(ConnectionError):  # some systems say here that an answer could not be delivered
+            with contextlib.suppress(ConnectionError):  # some systems report an undelivered answer here
                 return self._socket.recvfrom(_MOST)
 
     def _packet(self, data: bytes, sender: tuple[str, int]) -> Packet | None:
-        """A packet that a client may send, with the same contract; others are counted, and refused if they are of this link."""
+        """A valid packet of a client with the same contract. Others are counted; those of this link are refused."""
         try:
             packet = unpack(data)
         except RobotError as error:
@@ -264,13 +265,13 @@ class UdpServer:
         return packet
 
     def _drop(self, why: str, sender: tuple[str, int] | None = None, say: str = "") -> None:
-        """Count a packet, and tell its sender."""
+        """Count a dropped packet, and send the reason to its sender."""
         self.dropped[why] += 1
         if sender:
             self._send(pack(REFUSED, self._digest, self._count, say.encode()), sender)
 
     def _send(self, answer: bytes, to: tuple[str, int]) -> bool:
-        """Whether it could be sent: nobody can be answered at port 0."""
+        """Whether it was sent: port 0 cannot receive."""
         try:
             self._socket.sendto(answer, to)
         except OSError:
@@ -288,7 +289,7 @@ class UdpServer:
 
 
 def drive(folder: Path, contract: Contract, address: tuple[str, int], command: Floats, seconds: float) -> None:
-    """Drive the robot at ``address`` with one command; prints a line a second and one at the end."""
+    """Drive the robot at ``address`` with a constant command. Prints a line per second and one at the end."""
     period = contract.period
 
     def tell(now: float, measured: Measurement) -> None:
@@ -296,7 +297,7 @@ def drive(folder: Path, contract: Contract, address: tuple[str, int], command: F
             velocity = f"vx {measured.lin_vel[0]:6.2f} m/s  vy {measured.lin_vel[1]:6.2f} m/s  yaw rate {measured.ang_vel[2]:6.2f} rad/s"
             print(f"{now:6.1f} s  {velocity}", flush=True)
 
-    controller = Controller(folder, contract)  # first: a robot that is taken waits half a second for a target
+    controller = Controller(folder, contract)  # first: a connected robot waits 0.5 s for a target
     done = run(UdpRobot(contract, address), controller, lambda _: command, seconds, watch=tell)
     if done.fell is not None:
         print(f"it fell after {done.fell:.1f} s; its servos were switched off")

@@ -1,7 +1,7 @@
-"""Turn a policy of unitree_rl_lab into an export of ours: python examples/unitree_rl_lab.py POLICY LIKE OUT
+"""Convert a policy of unitree_rl_lab to an export: python examples/unitree_rl_lab.py POLICY LIKE OUT
 
-POLICY holds ``params/deploy.yaml`` and ``exported/policy.onnx``. LIKE is one of our exports of the same robot: its scene
-gets the policy's gains and start. The inverse of ``legged-mw deploy DIR --deploy_yaml OUT``.
+POLICY has ``params/deploy.yaml`` and ``exported/policy.onnx``. LIKE is our export of the same robot. Its scene gets
+the policy's gains and start pose. The inverse is ``legged-mw deploy DIR --deploy_yaml OUT``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from legged_mw.utils.files import digest
 
 
 class Loader(yaml.SafeLoader):
-    """Isaac Lab writes Python's slice(None) for all joints, which no safe loader knows; nothing here reads it."""
+    """Isaac Lab writes Python's slice(None) for all joints, which a safe loader does not know. It is not used here."""
 
 
 Loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: None)
@@ -77,11 +77,11 @@ def main(policy: Path, like: Path, out: Path) -> None:
     print(f"written to {out}: {len(joints)} joints, {contract.size} values of observation; mass {contract.mass:.1f} kg")
 
 
-SENSORS = {"joint_pos": "jointpos", "joint_vel": "jointvel", "joint_torque": "torque"}  # as our exports name them
+SENSORS = {"joint_pos": "jointpos", "joint_vel": "jointvel", "joint_torque": "torque"}  # names in our exports
 
 
 def row(name: str, term: dict[str, Any]) -> ContractRow:
-    """A row, by the program's name of it."""
+    """A row of the contract from a term of deploy.yaml."""
     measured = next((what for what, (theirs, _) in TERMS.items() if theirs == name), None)
     if measured is None:
         raise SystemExit(f"no row {name!r} here; there are: {', '.join(theirs for theirs, _ in TERMS.values())}")
@@ -99,14 +99,14 @@ def commands_of(ranges: dict[str, Any]) -> tuple[Command, ...]:
 
 
 def scene_of(file: Path, contract: Any) -> str:
-    """The scene with the policy's gains, unlimited targets, and its default pose as the start."""
+    """The scene with the policy's gains and default pose, and targets without limits."""
     spec = mujoco.MjSpec.from_file(str(file))
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # Euler does not bear 10 N m s/rad at a wrist
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # Euler is unstable with 10 N m s/rad at a wrist
     for joint, stiffness, damping in zip(contract.joints, contract.stiffness, contract.damping, strict=True):
         servo = spec.actuator(joint)
         servo.gainprm[0], servo.biasprm[1] = stiffness, -stiffness
         servo.ctrllimited, servo.ctrlrange = mujoco.mjtLimited.mjLIMITED_FALSE, [0.0, 0.0]
-        spec.joint(joint).damping = [damping, 0.0, 0.0]  # of the servo: our exports keep it at the joint
+        spec.joint(joint).damping = [damping, 0.0, 0.0]  # damping of the servo: in our exports it is at the joint
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)

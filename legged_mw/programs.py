@@ -1,6 +1,6 @@
-"""The programs: legged-mw train, play, deploy, exam, fit, robot and tools. train.py and play.py of a clone are the first two.
+"""The programs: legged-mw train, play, deploy, exam, fit, robot and tools. train.py and play.py call the first two.
 
-Each imports what it needs when it starts: deploy also runs where torch is not installed.
+Each program imports its modules when it starts, so deploy runs without torch.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def start_quickly(gpu: str | None = "cpu") -> None:
-    """What legged_mw/fast does before torch is imported, where that folder is; ``gpu``: the device that was asked for."""
+    """Call the start of legged_mw/fast, if that package exists, before the import of torch. ``gpu``: the device."""
     if quick_start := fast("quick_start"):
         quick_start.begin(gpu)
 
@@ -47,7 +47,7 @@ def train() -> None:
     from legged_mw.rl import training
     from legged_mw.rl.ranks import quiet, this_rank
 
-    quiet(this_rank())  # from here on only the first of several processes prints
+    quiet(this_rank())  # from here on only the first process prints
     find_exam(task := load_task(args.task, say=True))
     start, device = training.configure(task, args)
     for line in check_class(task.env_class, task.cfg.to_dict()["rewards"]["scales"]):
@@ -67,7 +67,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     env = training.build(task, start, device, args.eager, check)
     wrong, odd = doubts(task)
     if args.check:
-        training.make_learner(task, env, start)  # what it refuses is found now
+        training.make_learner(task, env, start)  # raise its errors now
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         print(
             "".join(["what to look at\n", *(f"  - {line}\n" for line in [*wrong, *odd])]) if wrong or odd else "",
@@ -118,9 +118,9 @@ def play() -> None:
 
 
 def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
-    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it.
+    """Grade the same policy on MuJoCo's C engine, through an export, as ``legged_mw.deploy`` does.
 
-    ``hard``: the hard exam too, where the task walks.
+    ``hard``: also the hard exam, if the task walks.
     """
     from legged_mw.deploy.exam import run
     from legged_mw.envs.domain_rand import active
@@ -128,7 +128,7 @@ def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
 
     task = graded.task
     if active(task.cfg):
-        print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")
+        print("not graded through an export: an export has the nominal robot, and domain_rand changes it")
         return []
     with TemporaryDirectory() as folder:
         try:
@@ -136,14 +136,14 @@ def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
             export(task, graded.source.checkpoint, made)
             result, strip = run(made, graded.exam.rules(task), hard)
             return [Column("the same, deployed in MuJoCo", {}, result, strip=strip)]
-        except UserError as error:  # a row that nobody can measure, no onnxruntime
+        except UserError as error:  # a row without sensors, or no onnxruntime
             print(f"not graded through an export: {error}")
             return []
 
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:
-    """Export a policy with the config that it was trained with; returns what was written, in words."""
-    from legged_mw.export.exporter import export  # onnx takes a while to import
+    """Export a policy with its trained config. Returns a message about the files."""
+    from legged_mw.export.exporter import export  # onnx takes long to import
 
     return export(task, checkpoint, folder, half).text(folder)
 
@@ -157,7 +157,7 @@ def deploy() -> None:
 
 
 def exam() -> None:
-    """Grade a policy, and compare with an earlier result. A run that has no export is exported first."""
+    """Grade a policy, and compare with an earlier result. A run without an export is exported first."""
     from legged_mw.deploy.gate import main
 
     def make(name: str, checkpoint: int, folder: Path) -> None:
@@ -172,7 +172,7 @@ def exam() -> None:
 
 
 def robot() -> None:
-    """A robot's health page, and a first task for it."""
+    """Show a robot's health page, and write a first task for it."""
     from legged_mw.robot.__main__ import main
 
     with one_line_errors():
@@ -180,7 +180,7 @@ def robot() -> None:
 
 
 def _tool(name: str) -> Callable[[], None]:
-    """A program whose ``main`` does all."""
+    """A program that runs ``main`` of the tool."""
 
     def start() -> None:
         with one_line_errors():
@@ -190,7 +190,7 @@ def _tool(name: str) -> Callable[[], None]:
 
 
 def completion() -> None:
-    """The Tab key for bash and zsh."""
+    """Print the Tab completion for bash or zsh."""
     from legged_mw.tools.completion import main
 
     with one_line_errors():
@@ -243,8 +243,8 @@ def main() -> None:
     if name not in PROGRAMS:
         close = difflib.get_close_matches(name, PROGRAMS, n=1)
         hint = f", did you mean {close[0]!r}? " if close else "; "
-        asked = f"no program {name!r}{hint}" if name else ""
-        fail("legged-mw", f"{asked}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat")
+        problem = f"no program {name!r}{hint}" if name else ""
+        fail("legged-mw", f"{problem}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat")
     sys.argv = [f"legged-mw {name}", *sys.argv[2:]]
     PROGRAMS[name]()
 

@@ -446,10 +446,10 @@ CASES: dict[str, Case] = {
     ),
     "NaN from the policy": Case("the target of FL_hip_joint is not finite: nan", policy=acts(np.nan)),
     "infinity from the policy": Case("the target of FL_hip_joint is not finite: nan", policy=acts(np.inf)),
-    "NaN from an encoder": Case("what is measured is not finite: joint_pos", "nan=q"),
-    "NaN of a speed": Case("what is measured is not finite: joint_vel", "nan=dq"),
-    "NaN from the gyro": Case("what is measured is not finite: ang_vel", "nan=gyroscope"),
-    "NaN of the orientation": Case("what is measured is not finite: gravity", "nan=quaternion"),
+    "NaN from an encoder": Case("a measured value is not finite: joint_pos", "nan=q"),
+    "NaN of a speed": Case("a measured value is not finite: joint_vel", "nan=dq"),
+    "NaN from the gyro": Case("a measured value is not finite: ang_vel", "nan=gyroscope"),
+    "NaN of the orientation": Case("a measured value is not finite: gravity", "nan=quaternion"),
     "dead motor": Case(
         "the motor of FL_calf_joint reports a fault: it lost [0-9]+ messages in a period", "motor_fault=FL_calf_joint"
     ),

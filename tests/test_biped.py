@@ -423,7 +423,7 @@ def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch
     monkeypatch.setattr(
         exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(exported / "out/policy.onnx", path)
     )
-    text = "^legged_mw.deploy would act otherwise than the environment: observation row 'gait_clock' "
+    text = "^legged_mw.deploy would act differently from the environment: observation row 'gait_clock' "
     trained = load_task(str(ROOT / BIPED))
     update_from_run(trained, load_yaml(exported / "out/config.yaml"), where="config.yaml")
     with pytest.raises(ExportError, match=text):

@@ -94,7 +94,7 @@ def test_a_log_that_was_cut_off(logged: tuple[Path, Watched], tmp_path: Path) ->
     cut.write_bytes(whole[:-10])
     assert len(read_log(cut).rows["time"]) == 2 * CHUNK
     cut.write_bytes(whole[: 8 + int.from_bytes(whole[:8], "little") + 100])
-    with pytest.raises(LogError, match="holds no step: its run ended within the first 100, or was cut off"):
+    with pytest.raises(LogError, match="has no step: its run ended within the first 100 steps, or was interrupted"):
         read_log(cut)
 
 
@@ -102,7 +102,7 @@ def test_what_is_no_log(tmp_path: Path, contract: Contract) -> None:
     wrong, short = tmp_path / "wrong.lmwlog", b"\x05" + b"\0" * 7
     for content in (b"", b"no log", b"x" * 100, short + b"hello", b"\0" * 8, short + b"PK\x03\x04-"):
         wrong.write_bytes(content)
-        with pytest.raises(LogError, match=r"wrong.lmwlog is no log of legged_mw.deploy"):
+        with pytest.raises(LogError, match=r"wrong.lmwlog is not a log of legged_mw.deploy"):
             read_log(wrong)
     assert log_path(contract).parent == Path("logs/deploy") and log_path(contract).name.startswith("go2_flat_")
 

@@ -90,7 +90,7 @@ def test_what_is_measured(name: str, contract: Contract, limits: Limits) -> None
 
     assert check(limit - 1e-3) is None
     assert (trip := check(limit + 0.05)) and trip.limit == name and trip.text.startswith(text)
-    assert (trip := check(math.nan)) and trip.limit == "finite" and "what is measured is not finite: " in trip.text
+    assert (trip := check(math.nan)) and trip.limit == "finite" and "a measured value is not finite: " in trip.text
 
 
 HEALTH: dict[str, tuple[Health, Health, str]] = {
@@ -424,7 +424,7 @@ FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be 
     "NaN from a sensor": (
         measured_as(lambda _, m: replace(m, joint_vel=np.nan * m.joint_vel)),
         0,
-        "what is measured is not finite: joint_vel",
+        "a measured value is not finite: joint_vel",
     ),
     "an angle that jumps": (
         measured_as(lambda _, m: replace(m, joint_pos=m.joint_pos + 2.0)),

@@ -280,7 +280,7 @@ def test_it_is_driven_from_a_terminal(tmp_path: Path) -> None:
     how = ["--hoist", "yes", "--log", str(log), "--limit", "late=off", "--commands", str(script)]
     code, shown = in_terminal([str(GO1), "--drive", *how], presses)
     assert code == 0 and not presses, shown
-    assert "script.yaml: 2 of its pushes and resets are left out; a robot that is driven has commands alone" in shown
+    assert "script.yaml: 2 of its pushes and resets are left out; a driven robot gets only commands" in shown
     assert "damping: the emergency stop (key Esc)" in shown and "late" in shown and "begin late by median" in shown
     assert f"the joints are damped; logged to {log}" in shown
     recording = read_log(log)

@@ -162,7 +162,7 @@ def test_the_export_is_replaced_whole_or_not_at_all(
                 export(*arguments(made), out)
         assert files(tmp_path) == before
         if name == "run_onnx":
-            assert "policy.onnx acts otherwise than the trained policy: up to " in str(
+            assert "policy.onnx acts differently from the trained policy: up to " in str(
                 error.value
             ) and "nothing was written" in str(error.value)
     (out / "policy.yaml").write_text("stale")
@@ -187,9 +187,9 @@ def test_a_network_that_cannot_be_traced(made: Path, tmp_path: Path, monkeypatch
 
 def test_a_nan_is_a_mismatch() -> None:
     actions = np.zeros((3, 2))
-    with pytest.raises(ExportError, match="acts otherwise"):
+    with pytest.raises(ExportError, match="acts differently"):
         exporting._check_network(np.full((3, 2), np.nan), actions)
-    with pytest.raises(ExportError, match="acts otherwise"):
+    with pytest.raises(ExportError, match="acts differently"):
         exporting._check_network(np.zeros((1, 2)), actions)
 
 
@@ -438,7 +438,7 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
     spec = robot.spec.copy()
     spec.add_hfield(name="hills", file="hills.png")
     pose = env.default_dof_pos.tolist()
-    with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must stand alone"):
+    with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must need no other file"):
         standalone(
             type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose
         )
@@ -589,7 +589,7 @@ def export_of(
 def test_an_export_that_would_act_otherwise_is_refused(
     env_class: type[LeggedRobot], what: str, method: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ExportError, match="legged_mw.deploy would act otherwise than the environment: ") as error:
+    with pytest.raises(ExportError, match="legged_mw.deploy would act differently from the environment: ") as error:
         export_of(env_class, made, tmp_path / "out", monkeypatch)
     assert what in str(error.value) and f"{method}. State it where the contract can take it from" in str(error.value)
     assert not list(tmp_path.iterdir())

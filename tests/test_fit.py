@@ -141,10 +141,10 @@ def kept(rows: Callable[[int], slice]) -> Callable[[DriveLog], DriveLog]:
         (changed("joint_pos", lambda q: own(q, q[0, JOINT])), "its encoder is dead"),
         (changed("joint_pos", lambda q: own(q, q[:, JOINT] + 0.3 * (np.arange(len(q)) > 900))), "encoder jumps by 0.3"),
         (changed("joint_pos", lambda q: own(q, -1.5 + 0.05 * (q[:, JOINT] + 1.5))), "its motor is loose"),
-        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint does"),
+        (kept(lambda count: slice(0, count - 800)), "ends before the sweep of FL_calf_joint ends"),
         (kept(lambda count: slice(0, count, 10)), "has a measurement each 20 ms"),
-        (changed("state", lambda state: 0.0 * state), "holds no chirp"),
-        (changed("joint_pos", lambda q: q[:, :10]), "is of a robot with 10 joints"),
+        (changed("state", lambda state: 0.0 * state), "has no chirp"),
+        (changed("joint_pos", lambda q: q[:, :10]), "has 10 joints, and its export has 12"),
     ],
 )
 def test_a_log_that_cannot_be_fitted_is_refused(log: Path, change: Callable[[DriveLog], DriveLog], why: str) -> None:
@@ -157,7 +157,7 @@ def test_a_log_that_cannot_be_fitted_is_refused(log: Path, change: Callable[[Dri
 def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
     swing = np.sin(np.arange(1000.0))
     joint = fit.FittedJoint(JOINT, np.zeros(6), np.zeros(6), 0.5, 0.36, np.arange(1000.0), np.stack([swing] * 3))
-    with pytest.raises(LogError, match=r"FL_calf_joint cannot be fitted: the best numbers explain 74.1%"):
+    with pytest.raises(LogError, match=r"FL_calf_joint cannot be fitted: the fitted parameters explain 74.1%"):
         fit._check_explained(Path("log"), CALF, joint)
     fit._check_explained(Path("log"), CALF, joint._replace(after=0.05))
 
@@ -189,5 +189,5 @@ def test_sweeps_keep_the_contracts_limits() -> None:
             assert limits.lowest[joint] < targets.min() < targets.max() < limits.highest[joint]
             assert CONTRACT.stiffness[joint] * np.abs(sweeps.targets(joint)).max() < 0.5 * limits.motor[joint]
             assert np.abs(np.diff(targets)).max() < STEP * chirp.FASTEST * 1.5
-    with pytest.raises(RobotError, match="measurements each few ms"):
+    with pytest.raises(RobotError, match="a measurement every few ms"):
         at_rate(CONTRACT, limits, robot)

@@ -198,7 +198,7 @@ def test_its_chapter_in_the_report() -> None:
     assert "falls under all" in page and "data:image/png;base64" in page and "load of 3 kg" in page
     assert "strip" not in column.plain()
     fallen = {**column.exam["hard"], "looks": None}
-    assert hard.misses(fallen)[-1] == "falls while it is looked at" and hard.figures(fallen) == []
+    assert hard.misses(fallen)[-1] == "falls in the gait measurement" and hard.figures(fallen) == []
     assert report._hard(Column("mine", {}, {"hard": fallen}))
 
 

@@ -303,7 +303,7 @@ def test_an_export_whose_memory_deploy_would_not_forget_is_refused(
 
     monkeypatch.setattr(export_replay, "Controller", Forgetful)
     with pytest.raises(
-        ExportError, match=r"deploy would act otherwise than the environment: memory \d is 0 in the environment and "
+        ExportError, match=r"deploy would act differently from the environment: memory \d is 0 in the environment and "
     ):
         export(task, tmp_path / "model.pt", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -114,7 +114,9 @@ def test_without_a_disk_the_training_goes_on(tmp_path: Path, capsys: pytest.Capt
     console.open(tmp_path / "gone")
     console.iteration(1, 2, None, NUMBERS, {}, 1.0)
     warning, line = capsys.readouterr().out.splitlines()
-    assert warning == "WARNING: training.log cannot be written (No such file or directory); training goes on without"
+    assert (
+        warning == "WARNING: training.log cannot be written (No such file or directory); training continues without it"
+    )
     assert line.startswith("Learning iteration 1/2: ")
 
 

@@ -500,9 +500,7 @@ def test_a_file_without_feet(
         '<mujoco><worldbody><body name="arm"><inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/><body name="hand" pos="0 0 0.4">'
         '<joint name="wrist" axis="0 1 0" range="-1 1" limited="true"/><geom size="0.02"/></body></body></worldbody></mujoco>'
     )
-    text = (
-        "'arm', the root, is not above the lowest ends of limbs, hand; the health page is of robots that stand on them"
-    )
+    text = "'arm', the root, is not above the lowest ends of limbs, hand; the health page needs a robot that stands on them"
     assert text in complaint(monkeypatch, capsys, file)
 
 
@@ -603,7 +601,7 @@ def test_a_training_whose_physics_diverges_ends_with_the_joints_that_did_it(tmp_
         and "_calf_joint (" in result.err.partition("Lower")[0]
     )
     assert "Learning iteration 2/9" in result.out and "Learning iteration 3/9" not in result.out
-    assert "stopped: what it simulates is not finite" in result.out
+    assert "stopped: the simulated state is not finite" in result.out
     [*_, newest] = sorted((tmp_path / "logs").glob("*/*/model_*.pt"))
     weights = torch.load(newest, weights_only=True)["actor_state_dict"]
     assert newest.name == "model_2.pt" and all(bool(value.isfinite().all()) for value in weights.values())

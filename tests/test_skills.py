@@ -304,12 +304,12 @@ def check_switch(rescuer: Path) -> None:
     [
         (
             ["go1_flat", "go2_flat"],
-            "--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall",
+            "--switch fall needs two policies: python -m legged_mw.deploy DIR DIR2 --switch fall",
         ),
-        (["go1_flat", "--switch", "fall"], "--switch fall is of two policies"),
+        (["go1_flat", "--switch", "fall"], "--switch fall needs two policies"),
         (
             ["go1_flat", "go2_flat", "--switch", "fall", "--eval"],
-            "--switch is watched in simulation, on flat ground: leave --eval out",
+            "--switch is for simulation on flat ground: leave --eval out",
         ),
     ],
 )

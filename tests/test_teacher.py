@@ -86,7 +86,7 @@ def tuned(root: Path, student: Path) -> Path:
     ]
     result = run("train", root, *begun, "--run_name", "tuned")
     assert result.code == 0, result.err
-    assert "the critic learns alone for 1 iterations (warm_start.critic_warmup)" in result.out
+    assert "only the critic learns for 1 iterations (warm_start.critic_warmup)" in result.out
     return next(root.glob("logs/go1_rough_student/*_tuned"))
 
 

@@ -165,7 +165,7 @@ def test_doctor_says_what_is_there_and_what_mends(
         "    glfw           no screen\n",
         "    onnxruntime    not installed; it runs an export: pip install 'legged_mw[deploy]'\n",
         "load 99.0\n",
-        "  cores: others use this machine: what is measured now is slower than it could be\n",
+        "  cores: other programs use this machine: the measured speed is too low\n",
     ):
         assert line in said
     assert f"torch          {torch.__version__}\n" in said and "tasks, " in said

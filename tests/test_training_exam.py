@@ -128,7 +128,9 @@ def test_an_exam_that_fails_costs_the_training_nothing(tmp_path: Path, monkeypat
     monkeypatch.setattr(TrainingExam, "__call__", fail)
     result = run("train", tmp_path, *SMALL, "--max_iterations", "4", "--set", "runner.exam_interval=1")
     assert result.code == 0 and list(tmp_path.glob("logs/*/*/model_4.pt"))
-    assert result.out.count("WARNING: the exam failed, training goes on without: RuntimeError: no room for it") == 1
+    assert (
+        result.out.count("WARNING: the exam failed, training continues without it: RuntimeError: no room for it") == 1
+    )
 
 
 def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(

@@ -82,7 +82,7 @@ def test_after_a_silent_client_the_servos_are_off(contract: Contract) -> None:
     client = udp.UdpRobot(contract, server.address, timeout=60.0)
     client.write(contract.default_pose)
     thread.join(timeout=120)
-    assert said[-1].endswith("fell silent for 2 s; the joints are damped, no longer servoed")
+    assert said[-1].endswith("sent nothing for 2 s; the joints are damped, no longer servoed")
     robot.write(contract.default_pose)
     assert not robot.read().joint_torque.any()
     with pytest.raises(RobotError, match=r"robot at 127.0.0.1:\d+: .*; stopped \(start one with"):

@@ -400,7 +400,7 @@ def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
 
     sim = SimulatedUnitree(folder, read_contract(folder), Stubborn("unitree_go", "lo", domain))
     wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
-    with pytest.raises(RobotError, match="the robot's own program 'ai' does not let go of the motors"):
+    with pytest.raises(RobotError, match="the robot's own program 'ai' does not release the motors"):
         wire.prepare()
     assert sim.record.commands == 0
 

@@ -1,1 +1,1 @@
-"""Robots, one a file: the config that all tasks of a robot share. A task's bases are a robot, then a skill."""
+"""The robots, one per file: the config that all tasks of a robot share. The bases of a task are a robot and a skill."""

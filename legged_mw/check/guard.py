@@ -112,17 +112,17 @@ def tiny_cfg(cfg: RobotTaskCfg) -> RobotTaskCfg:
 
 def _own_methods(env_class: type) -> list[str]:
     """What the user's classes override, each with its line. If our code fails, one of these may be the cause."""
-    found = []
+    methods = []
     for kind in own_classes(env_class):
         names = [name for name in vars(kind) if name == "__init__" or not name.startswith(("__", "_abc"))]
-        found += [
+        methods += [
             (kind, name, vars(kind)[name])
             for name in names
             if hasattr(kind.__mro__[1], name) or name.startswith("_reward_")
         ]
     return [
         place_of(value) if inspect.isroutine(value) else f"{kind.__name__}.{name} = {value!r:.40}"
-        for kind, name, value in found
+        for kind, name, value in methods
     ]
 
 
@@ -347,7 +347,7 @@ def _put_back(owner: Any, path: Path, before: dict[Path, Any]) -> None:
 
 def _line_that_changes(step: Callable[[], None], look: Callable[[], object], otherwise: str) -> str:
     """Make another step, line by line. Return the line that changes the value of ``look``, if possible a user's."""
-    place, last, found, own = look(), otherwise, "", sys._getframe()
+    place, last, line, own = look(), otherwise, "", sys._getframe()
 
     def users(frame: FrameType) -> FrameType:
         each: FrameType | None = frame
@@ -358,9 +358,9 @@ def _line_that_changes(step: Callable[[], None], look: Callable[[], object], oth
         return frame
 
     def trace(frame: FrameType, event: str, arg: object) -> Any:
-        nonlocal last, found
-        if not found and look() != place:
-            found = last
+        nonlocal last, line
+        if not line and look() != place:
+            line = last
         at = frame.f_back if event == "return" else frame
         if at and not _library(at):
             at = users(at)
@@ -373,7 +373,7 @@ def _line_that_changes(step: Callable[[], None], look: Callable[[], object], oth
         step()
     finally:
         sys.settrace(debugger)
-    return found or otherwise
+    return line or otherwise
 
 
 def _library(frame: FrameType) -> bool:

@@ -1,7 +1,7 @@
 """Find every tensor that an environment holds, by a walk over its objects: all that a step may write.
 
-The guard finds by it the values that a resumed run would lack, the step compiler the values to compare. An exact resume
-itself reads a list, ``BaseTask.remembered``.
+The guard uses it to find values that a resumed run would lack. The step compiler uses it to compare values. An exact
+resume does not search: it reads the list ``BaseTask.remembered``.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Lost:
         for name, thing in _reach(self._env, "", set()):
             if not isinstance(thing, Tensor):
                 return f"what self.{name} remembers, a {type(thing).__name__}, is not kept"
-        kept = self._env.remembered().values()
-        whole = {value.data_ptr() for value in kept if value.nbytes == value.untyped_storage().nbytes()}
+        remembered = self._env.remembered().values()
+        whole = {value.data_ptr() for value in remembered if value.nbytes == value.untyped_storage().nbytes()}
         for name, value in _memory(self._env).items():
             if value.data_ptr() not in whole and not _same(_mark(value), self._before.get(name)):
                 return f"self.{name} is written by the step and not made by self.buffer()"
@@ -85,15 +85,15 @@ def _same(mark: tuple[int, Tensor], before: tuple[int, Tensor] | None) -> bool:
 def _memory(env: RobotTask) -> dict[str, Tensor]:
     """Name -> a whole storage that ``env`` reaches, flat; without the simulation's."""
     seen = {value.untyped_storage().data_ptr() for value in env.sim.memory().values()}
-    found: dict[str, Tensor] = {}
+    storages: dict[str, Tensor] = {}
     for name, value in _reach(env, "", set()):
         if not isinstance(value, Tensor):
             continue
         storage = value.untyped_storage()
         if storage.nbytes() and storage.data_ptr() not in seen:
             seen.add(storage.data_ptr())
-            found[name] = value.as_strided((storage.nbytes() // value.element_size(),), (1,), 0)
-    return found
+            storages[name] = value.as_strided((storage.nbytes() // value.element_size(),), (1,), 0)
+    return storages
 
 
 def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Any]]:

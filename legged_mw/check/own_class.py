@@ -1,6 +1,6 @@
 """Check a user's class: hooks that never call their parent's, methods of legged_gym that nothing calls here.
 
-Also the signs of the scales of our reward terms.
+It also checks the signs of the scales of our reward terms.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from typing import Any
 
 from legged_mw.utils.errors import StepError, place_of
 
-HOOKS = (  # every step or reset needs what their parents do; hooks of commands may be replaced
+HOOKS = (  # the parents' methods are needed in every step or reset; hooks of commands may be replaced
     *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
 )
-WITHOUT = "# without super"  # a comment in a method that does not call its parent's on purpose
-# Terms of RobotTask and LeggedRobot with a usual scale above 0; their other terms cost. A skill's own terms pay.
+WITHOUT = "# without super"  # a comment in a method that intentionally does not call its parent's
+# Terms of RobotTask and LeggedRobot with a positive usual scale; their other terms are costs. Not a skill's terms.
 PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )
-# What a class ported from legged_gym may define, which nothing here calls -> what is called. docs/from_legged_gym.md
+# Methods of a class ported from legged_gym that nothing here calls -> method that is called. docs/from_legged_gym.md
 LEGGED_GYM_METHODS: dict[str, str] = {
     "post_physics_step": "_step()",
     "_post_physics_step_callback": "_update_state() and _end_step()",
     "_get_noise_scale_vec": "observation_rows()",
     "reset_idx": "reset_envs(mask)",
-    "anneal": "on_training_progress(share)",  # not legged_gym's: ours, before
+    "anneal": "on_training_progress(share)",  # ours, of an earlier version
     "_reset_dofs": "_reset_robots(mask)",
     "_reset_root_states": "_reset_robots(mask)",
     "update_command_curriculum": "_update_command_curriculum(mask)",
@@ -88,7 +88,7 @@ def _own(env_class: type) -> Iterator[tuple[type, str, Callable[..., Any]]]:
 
 
 def _does_something(parents: tuple[type, ...], name: str) -> bool:
-    """Whether the parents' method ``name`` does more than to have a docstring."""
+    """Whether the parents' method ``name`` has code, not only a docstring."""
     method = next((vars(kind)[name] for kind in parents if name in vars(kind)), None)
     return method is not None and bool(re.search(r"self\.|return", _source(method)))
 

@@ -1,4 +1,4 @@
-"""Catch on a CPU what a CUDA graph cannot record: reads to the host, copies from it, shapes that depend on data.
+"""Detect on a CPU what a CUDA graph cannot record: reads to the host, copies from it, shapes that depend on data.
 
 On a CPU all tensors are on one device. So ``Births`` notes the tensors that the user's code makes without a device.
 """
@@ -140,8 +140,8 @@ class _FunctionGuard(TorchFunctionMode):
         self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None
     ) -> Any:
         kwargs = kwargs or {}
-        if self.guard.on and (found := _breach_of_call(func, args, kwargs)):
-            raise NotRecordable(found)
+        if self.guard.on and (fault := _breach_of_call(func, args, kwargs)):
+            raise NotRecordable(fault)
         return func(*args, **kwargs)
 
 
@@ -193,7 +193,7 @@ def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any
         return f"{call} copies data from the host; make the tensor once, in __init__"
     if name in _MOVES or (name == "to" and _moves(args[1:], kwargs)):
         return f"{call} copies between host and device; make the tensor on self.device, in __init__"
-    tensors = any(isinstance(arg, Tensor) for arg in args)  # normal(mean, std) takes its device from them
+    tensors = any(isinstance(arg, Tensor) for arg in args)  # normal(mean, std) takes the device from these tensors
     if name in _FACTORIES and func is getattr(torch, name) and not tensors and not {"device", "out"} & kwargs.keys():
         return f"{call} without a device makes a tensor on the host; add device=self.device"
     return ""
@@ -225,7 +225,7 @@ def _address(tensor: Tensor) -> int:
 
 
 def _users_line() -> str:
-    """The running line of the user's code; "" if our code runs, even if the user's called it."""
+    """The running line of the user's code; "" if our code runs, even if the user's code called it."""
     frame: FrameType | None = sys._getframe()
     while frame and is_library(frame.f_globals.get("__name__", ""), frame.f_code.co_filename):
         frame = frame.f_back

@@ -42,23 +42,21 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--serve", choices=ROBOTS[1:], help="simulate such a robot at --interface, for --robot to drive"
     )
     parser.add_argument(
-        "--interface", metavar="IF", help="network interface of the robot: eth0, or lo for one that is served here"
+        "--interface", metavar="IF", help="network interface of the robot: eth0, or lo for a robot of --serve"
     )
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: 0, as robots have it; on lo 1)")
-    velocity = (
-        "where a policy's base_lin_vel is from: truth of a simulated robot (its default), or odometry of legs and IMU"
-    )
+    velocity = "source of a policy's base_lin_vel: truth in simulation (its default), or odometry from legs and IMU"
     parser.add_argument("--velocity", choices=(TRUTH, ODOMETRY), help=velocity)
-    contact = "how odometry finds feet on the ground (default: measured where the robot does, else torque)"
+    contact = "odometry's source of foot contact (default: measured if the robot measures it, else torque)"
     parser.add_argument("--contact", choices=CONTACTS, help=contact)
     served = parser.add_argument_group("with --serve")
     served.add_argument(
         "--remote", metavar="FILE", help="a YAML script of its remote (default: the keys of this terminal)"
     )
-    fault = "what goes wrong, and when: delay=10,loss=5 or low_battery@8, again for more (docs/faults.md has them all)"
+    fault = "faults and their times: delay=10,loss=5 or low_battery@8; may be repeated (list: docs/faults.md)"
     served.add_argument("--fault", action="append", metavar="NAME[=VALUE][@S]", help=fault)
     served.add_argument(
-        "--watchdog", type=float, metavar="S", help="it damps after S seconds without a command (default: never)"
+        "--watchdog", type=float, metavar="S", help="damp after S seconds without a command (default: never)"
     )
 
 
@@ -67,33 +65,33 @@ def check_flags(args: argparse.Namespace) -> None:
     wire = args.robot == "unitree" or args.serve
     for name in _OF_A_ROBOT:
         if not wire and getattr(args, name) is not None:
-            raise UserError(f"--{name} is of a robot on a network: add --robot unitree or --serve unitree")
+            raise UserError(f"--{name} needs a robot on a network: add --robot unitree or --serve unitree")
     for name in _OF_SERVING:
         if not args.serve and getattr(args, name) is not None:
-            raise UserError(f"--{name} is of a robot that is simulated for others: add --serve unitree")
+            raise UserError(f"--{name} needs a served simulated robot: add --serve unitree")
     if args.watchdog is not None and not args.watchdog > 0.0:
         raise UserError(
-            f"--watchdog {args.watchdog:g}: a time of more than 0 s; without the flag it never damps by itself"
+            f"--watchdog {args.watchdog:g}: the time must be above 0 s; without the flag it never damps by itself"
         )
     if args.contact and args.velocity != ODOMETRY:
-        raise UserError(f"--contact is of leg odometry: add --velocity {ODOMETRY}")
+        raise UserError(f"--contact needs leg odometry: add --velocity {ODOMETRY}")
     if args.velocity and (args.serve or (args.velocity == TRUTH and wire)):
         raise UserError(
-            f"--velocity {args.velocity}: " + ("it is of the program that drives" if args.serve else NO_TRUTH)
+            f"--velocity {args.velocity}: " + ("only the program that drives has it" if args.serve else NO_TRUTH)
         )
     if not wire:
         return
     if args.serve and args.robot != "simulated":
-        raise UserError("--serve is the robot and --robot drives one: start them as two programs")
+        raise UserError("--serve is a robot and --robot drives one: start two programs")
     if args.interface is None:
         raise UserError(
-            "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here"
+            "name the robot's network interface: --interface eth0, or --interface lo for a robot of --serve on this machine"
         )
     given = {name: getattr(args, name) for name in ("eval", "terrain", "video", "sheet")}
     given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer not in launch.UNSEEN}
     others = [name for name, value in given.items() if value]
     if others:
-        raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")
+        raise UserError(f"--{others[0]} needs simulated robots in this program: leave it out")
 
 
 def driver(name: str) -> Any:
@@ -141,7 +139,7 @@ def parse() -> argparse.Namespace:
         "--eval", action="store_true", help=f"the task's exam; prints its table and writes {RESULT_FILE}"
     )
     parser.add_argument(
-        "--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE}; of a shipped one in logs)"
+        "--out", metavar="FILE", help=f"file of --eval (default: DIR/{RESULT_FILE}; for a shipped policy in logs)"
     )
     common = (
         "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
@@ -158,16 +156,14 @@ def parse() -> argparse.Namespace:
         "--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)"
     )
     parser.add_argument(
-        "--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it"
+        "--terrain", action="store_true", help=f"run on the steps and blocks of {TERRAIN_FILE}, if the export has it"
     )
-    scene = (
-        "run and grade it in this MJCF of yours, such as a vendor's own: joints by name, servos by the policy's gains"
-    )
+    scene = "run and grade in your own MJCF, such as a vendor's: joints by name, servos with the policy's gains"
     parser.add_argument("--scene", metavar="FILE", help=scene)
     parser.add_argument(
         "--edited",
         action="store_true",
-        help="you changed what is exported: each number is shown beside the exported one",
+        help="accept changes of an export: each changed value is printed with the exported one",
     )
     unitree = "write the policy for unitree_rl_lab's program: OUT/params/deploy.yaml and OUT/exported/policy.onnx"
     parser.add_argument("--deploy_yaml", metavar="OUT", help=unitree)
@@ -189,29 +185,29 @@ def parse() -> argparse.Namespace:
 def _refuse(parser: Parser, args: argparse.Namespace) -> None:
     """Refuse flags of the exam, of a scene and of two policies that do not go together."""
     if args.eval and (
-        asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
+        flags := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
     ):
-        parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
+        parser.error(f"--eval has its own commands, flat ground and no viewer: leave {flags[0]} out")
     if (args.second is None) != (args.switch is None):
-        parser.error("--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
+        parser.error("--switch fall needs two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
     others = [f"--{name}" for name in ("eval", "drive", "serve", "terrain", "velocity", "scene") if getattr(args, name)]
     if args.switch and (others := others + ["--robot"] * (args.robot != "simulated")):
-        parser.error(f"--switch is watched in simulation, on flat ground: leave {others[0]} out")
+        parser.error(f"--switch is for simulation on flat ground: leave {others[0]} out")
     if args.ranges and not args.eval:
-        parser.error("--ranges says what the exam asks: add --eval")
+        parser.error("--ranges is for the exam: add --eval")
     apart = [f"--{name}" for name in ("drive", "serve", "terrain", "velocity", "replay") if getattr(args, name)]
     if args.scene and (apart := apart + ["--robot"] * (args.robot != "simulated")):
-        parser.error(f"--scene is of a simulated robot in a world of yours: leave {apart[0]} out")
+        parser.error(f"--scene simulates a robot in your own scene: leave {apart[0]} out")
     if args.no_hard and not args.eval:
-        parser.error("--no_hard leaves a part of the exam out: add --eval")
+        parser.error("--no_hard is for the exam: add --eval")
     if args.command is not None and args.commands:
-        parser.error("--commands brings its own commands: leave --command out")
+        parser.error("--commands has its own commands: leave --command out")
 
 
 def main() -> None:
     args = parse()
     for each in map(find, filter(None, (args.folder, args.second))) if args.edited else ():
-        print("\n".join(edits(each)) or f"{shown(each)}: nothing was changed in what the network was trained with")
+        print("\n".join(edits(each)) or f"{shown(each)}: no value was changed that training used")
     if args.replay:
         show_log(args.replay, find(args.folder) if args.folder else None, args.edited)
         return
@@ -298,11 +294,11 @@ def examine(
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
         if common:
-            raise UserError("--ranges says what the walking exam asks: leave it out")
+            raise UserError("--ranges is only for the walking exam: leave it out")
         if contact:
-            raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
+            raise UserError("--velocity odometry needs the walking exam, and this policy has another: leave it out")
         if isinstance(scene, Path):
-            raise UserError("--scene is of robots that walk, and this exam has grounds of its own: leave it out")
+            raise UserError("--scene needs the walking exam, and this policy's exam has its own grounds: leave it out")
         rules: walking.ExamRules | Skill = contract_skill(contract)
         result = run_skill(folder, rules, edited=edited)
         print(rules.table(result))

@@ -1,7 +1,7 @@
-"""The chirp: after the joint check the joints of a hanging robot follow sines of rising frequency, one of each limb at a time.
+"""The chirp: after the joint check, the joints of a hanging robot follow sines of rising frequency.
 
-Its log is what ``legged-mw fit`` reads: slot after slot, every measurement that the robot sends. The joints of a slot
-are of different limbs. Their shapes stay apart, and they move each other through the root alone.
+``legged-mw fit`` reads its log, which has every measurement that the robot sends. A slot moves one joint of each of
+several limbs. These limbs do not touch, and affect each other only through the root.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import SHAPES, DeployScene
 from legged_mw.deploy.states import CHIRP, Order
 
-SECONDS = 58.0  # [s] ours: of all sweeps together
-MOVE, SETTLE, REST = 2.0, 1.0, 0.2  # [s] ours: to the pose; there; before and after each sweep
-FADE = 0.3  # [s] ours: in which a sweep's amplitude rises, and falls
-AMPLITUDE, FASTEST = 0.4, 4.0  # [rad], [rad/s] ours: of a target, at most
-TORQUE, ROOM, SPEED = 0.4, 0.8, 0.3  # [share] of the motor's torque, of the way to the range's end, of the top speed
-SLOWEST, RANGE, ABOVE = 0.5, (3.0, 15.0), 3.0  # [Hz] begin and limits of the end; end by the servo's own frequency
-CLEAR = 0.02  # [m] ours: between two limbs, at least
-ASIDE, FARTHEST, PASSES = 0.05, 12, 3  # [rad] ours: step of a joint aside; [-] steps at most; passes over the joints
+SECONDS = 58.0  # [s] ours: total duration of all sweeps
+MOVE, SETTLE, REST = 2.0, 1.0, 0.2  # [s] ours: motion to the pose; waiting there; pause before and after each sweep
+FADE = 0.3  # [s] ours: rise and fall of a sweep's amplitude
+AMPLITUDE, FASTEST = 0.4, 4.0  # [rad], [rad/s] ours: upper bounds of a target's amplitude and speed
+TORQUE, ROOM, SPEED = 0.4, 0.8, 0.3  # shares of motor torque, of the distance to the limit, of top speed
+SLOWEST, RANGE, ABOVE = 0.5, (3.0, 15.0), 3.0  # [Hz] first frequency; bounds of the last; last / servo's natural one
+CLEAR = 0.02  # [m] ours: smallest distance of two limbs
+ASIDE, FARTHEST, PASSES = 0.05, 12, 3  # [rad] ours: step of a joint; [-] most steps; passes over the joints
 
 
 def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract, Limits]:
-    """Contract and limits of a run in which each measurement of ``robot`` is a step, and the policy does not act.
+    """Contract and limits for a step at each measurement of ``robot``. The policy does not act.
 
     Raises RobotError if the robot measures no faster than a policy acts.
     """
     if robot.step is None:
         raise RobotError(
-            f"--chirp needs measurements each few ms, and {type(robot).__name__} gives one a period: take --robot unitree, "
-            "on lo for one that --serve simulates"
+            f"--chirp needs a measurement every few ms, and {type(robot).__name__} gives one per period: use --robot unitree, "
+            "with --interface lo for a robot of --serve"
         )
     slower = contract.period / robot.step
     counted = {name: slower * getattr(limits, name) for name in ("age", "frozen", "late")}  # in steps
@@ -50,21 +50,21 @@ def at_rate(contract: Contract, limits: Limits, robot: Robot) -> tuple[Contract,
 
 
 class ChirpPlan(NamedTuple):
-    """What a chirp moves, and how far."""
+    """The joints of a chirp and their motion."""
 
-    pose: Floats  # (D,) [rad] of which the sweeps are about
+    pose: Floats  # (D,) [rad] centre of the sweeps
     amplitude: Floats  # (D,) [rad]
     highest: Floats  # (D,) [Hz]
     slots: list[list[int]]  # joints that sweep at the same time
 
     @property
     def seconds(self) -> float:
-        """[s] of a sweep."""
+        """[s] duration of a sweep."""
         return SECONDS / len(self.slots) - 2 * REST
 
 
 class Chirp(JointCheck):
-    """The joint check of one robot; if all joints are right, their sweeps."""
+    """The joint check of one robot. If all joints are right, the sweeps follow."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Chirp(JointCheck):
         robot: Robot,
         limits: Limits,
     ) -> None:
-        """Raises RobotError if the robot cannot move softly."""
+        """Raises RobotError if the robot cannot change its gains."""
         super().__init__(controller, sources, say, robot, limits)
         self._now, self._swept = 0.0, 0
         self.plan = plan(controller.contract, self._scene, limits)
@@ -84,7 +84,7 @@ class Chirp(JointCheck):
 
     @property
     def right(self) -> bool:
-        """True if every joint is right and was swept."""
+        """True if every joint is right and its sweep is complete."""
         return super().right and self._swept == len(self.joints)
 
     @property
@@ -98,11 +98,13 @@ class Chirp(JointCheck):
     def _check(self, measured: Measurement) -> Moves:
         yield from super()._check(measured)
         if super().right:
-            self._enter(CHIRP, self._now, "the joints follow sines of rising frequency, one of each limb at a time")
+            self._enter(
+                CHIRP, self._now, "the joints follow sines of rising frequency, one joint of each limb at a time"
+            )
             yield from self._chirp(measured)
 
     def _chirp(self, begun: Measurement) -> Moves:
-        """From where the joint check held the joints, as ``begun``, to the plan's pose, and all sweeps."""
+        """Move from the joint check's pose ``begun`` to the plan's pose, then run all sweeps."""
         begin = np.clip(begun.joint_pos, self._limits.lowest, self._limits.highest)
         count, settle = (round(seconds / self.controller.contract.period) for seconds in (MOVE, SETTLE))
         for step in range(count + settle):
@@ -113,7 +115,7 @@ class Chirp(JointCheck):
 
     def _sweep(self, slot: Sequence[int]) -> Generator[Order, Measurement, None]:
         self._tell(f"{', '.join(self.joints[joint] for joint in slot)} sweep")
-        signs = (-1.0) ** np.arange(len(slot))  # neighbours move against each other, so that the root swings less
+        signs = (-1.0) ** np.arange(len(slot))  # neighbours move in opposite directions, so that the root swings less
         for targets in signs * np.stack([self.targets(joint) for joint in slot], axis=1):
             pose = self.plan.pose.copy()
             pose[slot] += targets
@@ -139,10 +141,10 @@ class Chirp(JointCheck):
 
 
 def plan(contract: Contract, scene: DeployScene, limits: Limits) -> ChirpPlan:
-    """Sweeps within the contract's limits.
+    """Plan sweeps within the contract's limits.
 
-    Two joints of a slot bring no shapes of two limbs nearer than CLEAR. The root's shapes are not checked, and a joint
-    that meets another limb from every pose that was tried sweeps nevertheless, alone.
+    In a slot, shapes of two limbs keep a distance of CLEAR. The root's shapes are not checked. A joint that touches
+    another limb from every tested pose gets its own slot.
     """
     data, inertia = mujoco.MjData(scene.model), np.zeros((scene.model.nv, scene.model.nv))
     mujoco.mj_resetDataKeyframe(scene.model, data, 0)
@@ -161,7 +163,7 @@ def plan(contract: Contract, scene: DeployScene, limits: Limits) -> ChirpPlan:
 
 
 def _limbs(model: mujoco.MjModel, joints: Sequence[str]) -> dict[int, int]:
-    """The limb of each body: 0 for the root, then one for each chain of joints up to where it branches."""
+    """The limb of each body: 0 for the root, and one for each chain of joints up to a branch."""
     moved = {int(model.joint(name).bodyid[0]) for name in joints}
     carrier, limbs = dict[int, int](), dict[int, int]()
     for body in range(1, model.nbody):  # parents come first
@@ -179,7 +181,7 @@ Touches = Callable[[Floats], int]
 
 
 def _touches(scene: DeployScene, joints: Sequence[str], limbs: dict[int, int]) -> Touches:
-    """A function that counts the shapes of different limbs that are nearer than CLEAR in a pose (D,)."""
+    """A function that counts the shapes of different limbs with a distance below CLEAR in a pose (D,)."""
     spec = scene.spec.copy()
     for body in spec.bodies[1:]:
         limb = 1 << limbs[scene.model.body(body.name).id]
@@ -203,7 +205,7 @@ def _touches(scene: DeployScene, joints: Sequence[str], limbs: dict[int, int]) -
 
 
 def _ends(pose: Floats, amplitude: Floats, joints: Sequence[int]) -> list[Floats]:
-    """The poses in which each of ``joints`` is at an end of its sweep."""
+    """The poses in which each of ``joints`` is at one end of its sweep."""
     poses = []
     for signs in product((-1.0, 1.0), repeat=len(joints)):
         poses.append(pose.copy())
@@ -214,22 +216,22 @@ def _ends(pose: Floats, amplitude: Floats, joints: Sequence[int]) -> list[Floats
 def _clear_pose(pose: Floats, amplitude: Floats, low: Floats, high: Floats, touches: Touches) -> Floats:
     """A pose near ``pose`` from which each joint can sweep alone, if there is one."""
     default, pose = pose, pose.copy()
-    asides = sorted(ASIDE * np.arange(-FARTHEST, FARTHEST + 1), key=abs)
+    offsets = sorted(ASIDE * np.arange(-FARTHEST, FARTHEST + 1), key=abs)
     for _ in range(PASSES):
-        for joint in reversed(range(len(pose))):  # of a limb, those that carry less first
-            angles = [default[joint] + aside for aside in asides]
+        for joint in reversed(range(len(pose))):  # the last joints of a limb first
+            angles = [default[joint] + offset for offset in offsets]
             inside = [angle for i, angle in enumerate(angles) if not i or low[joint] <= angle <= high[joint]]
-            met = list[int]()
+            contacts = list[int]()
             for pose[joint] in inside:
-                met.append(sum(map(touches, _ends(pose, amplitude, [joint]))))
-                if not met[-1]:
+                contacts.append(sum(map(touches, _ends(pose, amplitude, [joint]))))
+                if not contacts[-1]:
                     break
-            pose[joint] = inside[met.index(min(met))]
+            pose[joint] = inside[contacts.index(min(contacts))]
     return pose
 
 
 def _slots(limb: Sequence[int], pose: Floats, amplitude: Floats, touches: Touches) -> list[list[int]]:
-    """Each joint in the first slot of other limbs' joints that it cannot meet."""
+    """Put each joint into the first slot of joints of other limbs that it cannot touch."""
     slots = list[list[int]]()
     for joint in range(len(pose)):
         for slot in slots:

@@ -100,8 +100,8 @@ class Reader:
 
     def scale(self, count: int, of: str) -> np.ndarray:
         """The value of ``scale``: one number per value. The file may give one number for all."""
-        wanted = f"a number, or {count} numbers, one a {of}"
-        value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
+        expected = f"a number, or {count} numbers, one a {of}"
+        value = self.take("scale", expected, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
         self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
         return np.full(count, value, dtype=float) if is_number(value) else np.array(value, dtype=float)
 
@@ -188,7 +188,7 @@ def target_range(model: mujoco.MjModel, actuators: Sequence[int]) -> tuple[np.nd
 def _range_of_scene(scene: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     if not scene.is_file():
         raise ContractError(
-            f"policy.yaml is of a format that leaves the range of the targets to {scene.name}, which is not beside it: put it there, "
+            f"policy.yaml has an old format without the range of the targets, and {scene.name}, which has it, is missing: put it there, "
             "or export the policy again"
         )
     model = compile_scene(scene)
@@ -263,9 +263,9 @@ class NetworkMemory(NamedTuple):
 
 def read_memory(section: Reader) -> NetworkMemory:
     """Read the section ``memory``."""
-    wanted = "two whole numbers from 1: states and the size of each"
+    expected = "two whole numbers from 1: states and the size of each"
     shape = section.take(
-        "shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
+        "shape", expected, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
     )
     section.take("shape", f"{MOST_VALUES} values at most", lambda v: v[0] * v[1] <= MOST_VALUES)
     return NetworkMemory(section.text("input"), section.text("output"), tuple(shape))
@@ -368,10 +368,12 @@ def read_ratings(section: Reader, joints: int) -> Ratings:
     for name in section.values:
         if name not in Ratings._fields:
             raise ContractError(f"{section.where}: {unknown('rating', name, Ratings._fields, RATINGS)}")
-    tables, wanted = {}, f"a number above zero, or {joints} of them, one a joint, null where unknown"
+    tables, expected = {}, f"a number above zero, or {joints} of them, one a joint, null where unknown"
     for name in TABLES:
         if name in section.values:
-            value = section.take(name, wanted, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints))
+            value = section.take(
+                name, expected, lambda v: _rates(v) or (is_list(v, _rates_or_none) and len(v) == joints)
+            )
             tables[name] = value if isinstance(value, list) else [value] * joints
     return make_ratings(tables, section.above_zero(BATTERY) if BATTERY in section.values else None, joints)
 
@@ -411,9 +413,7 @@ def make_network(folder: Path, motors: Motors, count: int, joints: int) -> Netwo
     if not (folder / MOTORS_FILE).is_file():
         raise ContractError(f"no {MOTORS_FILE} in {folder}, the network of its motors; export the policy again")
     if digest(folder / MOTORS_FILE) != motors.digest:
-        raise ContractError(
-            f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again"
-        )
+        raise ContractError(f"{MOTORS_FILE} is not the exported file: its SHA-256 differs; export the policy again")
     return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)
 
 
@@ -672,7 +672,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
     part(folder, NETWORK_FILE)
     if digest(folder / NETWORK_FILE) != contract.digest:
         raise ContractError(
-            f"{NETWORK_FILE} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): "
+            f"{NETWORK_FILE} is not the exported file (its SHA-256 differs): "
             "it is damaged, or of another export; export the policy again"
         )
     if edited:
@@ -691,9 +691,7 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
             f"{advice}"
         )
     for name in _changed_files(folder, contract):
-        raise ContractError(
-            f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {advice}"
-        )
+        raise ContractError(f"{name} is not the exported file (its SHA-256 differs): {advice}")
     return contract
 
 
@@ -881,7 +879,7 @@ def _check_rows(contract: Contract) -> None:
             )
         if row.measured in REFERENCE and not contract.motion:
             raise ContractError(
-                f"{where} is of a motion, and the contract has no section `{MOTION}`; export the policy again"
+                f"{where} needs a motion, and the contract has no section `{MOTION}`; export the policy again"
             )
         if row.measured not in measurable:
             raise ContractError(

@@ -235,7 +235,7 @@ class Network:
         outputs = self._first(lambda: self._session.run([*self._outputs], zeros, self._run), "run")
         for (name, shape), value in zip(self._outputs.items(), outputs, strict=True):
             if np.shape(value) != (1, *shape) or not np.isfinite(value).all():
-                problem = np.shape(value) if np.shape(value) != (1, *shape) else "what is not finite"
+                problem = np.shape(value) if np.shape(value) != (1, *shape) else "not finite"
                 raise ContractError(
                     f"{NETWORK_FILE}: its output '{name}' for an observation of zeros is {problem}; export the policy again"
                 )

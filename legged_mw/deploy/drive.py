@@ -45,32 +45,26 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--drive",
         action="store_true",
-        help="from the terminal as on a robot: states, safety limits, a log; in real time",
+        help="drive from the terminal as on a robot: states, safety limits, a log; in real time",
     )
-    check_help = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
+    check_help = "instead of the policy, move each joint by 0.1 rad and back with a tenth of the stiffness, and compare the motion"
     parser.add_argument("--check_joints", action="store_true", help=check_help)
-    chirp_help = (
-        "the joint check, then a sweep of each joint of a hanging robot, whose log legged-mw fit reads (docs/fit.md)"
-    )
+    chirp_help = "run the joint check, then sweep each joint of a hanging robot, for legged-mw fit (docs/fit.md)"
     parser.add_argument("--chirp", action="store_true", help=chirp_help)
-    walk_help = "a robot's first walk: joint check, stand, stop, ten steps, a metre, each value beside the exam's robot"
+    walk_help = "run a robot's first walk: joint check, stand, stop, ten steps, a metre; compare with the exam's robot"
     parser.add_argument("--first_walk", action="store_true", help=walk_help)
     hoist_help = (
         "a simulated robot hangs until the policy starts (default: if it has two feet), "
-        "high: its feet in the air, as in --check_joints"
+        "high: with its feet in the air, as for --check_joints"
     )
     parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hoist_help)
-    limit_help = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
+    limit_help = "change a safety limit, e.g. tilt=45 or frozen=off (list: docs/on_the_robot.md)"
     parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limit_help)
-    parser.add_argument(
-        "--gamepad", metavar="FILE", help="a gamepad that drives too (default: the first that is there), or off"
-    )
+    parser.add_argument("--gamepad", metavar="FILE", help="a gamepad (default: the first one found), or off")
     parser.add_argument(
         "--stop_fd", type=int, metavar="N", help="damp the robot when this file descriptor can be read or is closed"
     )
-    parser.add_argument(
-        "--log", metavar="FILE", help="where the run is logged (default: a new file in logs/deploy), or off"
-    )
+    parser.add_argument("--log", metavar="FILE", help="file of the log (default: a new file in logs/deploy), or off")
     parser.add_argument(
         "--replay", type=Path, metavar="LOG", help="draw a log beside the simulation of the same commands"
     )
@@ -88,14 +82,14 @@ def check_flags(args: argparse.Namespace) -> None:
     if args.chirp and (others := others + ["check_joints"] * args.check_joints):
         raise FlagError(f"--chirp moves one joint of a robot at a time, after a joint check: leave --{others[0]} out")
     if args.first_walk and (others := others + [n for n in ("check_joints", "chirp") if getattr(args, n)]):
-        raise FlagError(f"--first_walk is a list with commands and a joint check of its own: leave --{others[0]} out")
+        raise FlagError(f"--first_walk has its own commands and joint check: leave --{others[0]} out")
     args.drive |= _checks_joints(args)
     other_modes = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
     allowed = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
     viewer_flags = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in allowed]
     driving_flag = "--drive" if args.drive else f"--robot {args.robot}" if args.robot != "simulated" else ""
     if driving_flag and (refused := [name for name, value in other_modes.items() if value] + viewer_flags):
-        raise FlagError(f"{driving_flag} is one robot in real time: leave --{refused[0]} out")
+        raise FlagError(f"{driving_flag} drives one robot in real time: leave --{refused[0]} out")
     drive_flags = {
         "hoist": args.hoist and not args.serve,
         "limit": args.limit,
@@ -104,7 +98,7 @@ def check_flags(args: argparse.Namespace) -> None:
         "log": args.log,
     }
     if not driving_flag and (refused := [name for name, value in drive_flags.items() if value]):
-        raise FlagError(f"--{refused[0]} is of a robot that is driven: add --drive")
+        raise FlagError(f"--{refused[0]} needs a driven robot: add --drive")
     parse_limits(args.limit)
 
 
@@ -182,7 +176,7 @@ def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], 
     if args.stop_fd is not None:
         sources.append(StopFile(args.stop_fd))
     if pad := _gamepad(contract, args.gamepad):
-        say(f"{pad.path} drives too; pulling its plug damps the robot")
+        say(f"{pad.path} can drive; unplugging it damps the robot")
         sources.append(pad)
     if sys.stdin.isatty():
         sources.append(Keys(contract.commands))
@@ -209,7 +203,7 @@ def _commands(
     script = load_script(args.commands, contract.commands).entries
     if others := sum((entry.push is not None) + entry.reset for entry in script):
         say(
-            f"--commands {args.commands}: {others} of its pushes and resets are left out; a robot that is driven has commands alone"
+            f"--commands {args.commands}: {others} of its pushes and resets are left out; a driven robot gets only commands"
         )
     entries = [(entry.time, np.array(entry.command)) for entry in script if entry.command]
     return lambda time: next((command for start, command in reversed(entries) if start <= time + 1e-9), default)

@@ -1,8 +1,8 @@
-"""A robot's own numbers from the log of its chirp: delay, armature, friction, damping, gain and encoder offset a joint.
+"""Fit the parameters of each joint to the log of a chirp: delay, armature, friction, damping, gain, encoder offset.
 
-Each joint's sweep is replayed in MuJoCo's C engine with what hangs on it. The root moves as the IMU felt it, and the
-other joints as they were measured, so the robot may swing on its rope. mujoco.minimize.least_squares finds the numbers
-with which angles and speeds are nearest to those measured.
+Each sweep is simulated in MuJoCo's C engine, with the bodies that the joint moves and the bodies that carry it. The
+root follows the IMU and the other joints follow their measured angles, so the robot may swing on its rope.
+mujoco.minimize.least_squares minimizes the error of angles and speeds.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import typed
 from legged_mw.utils.machine import usable_cores
 
-ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: about the noise of an encoder; weights of the residual
-HEAVY = 1e6  # [kg], [kg m^2] ours: of a root and of joints that move as they are told
-SMOOTH = 9  # ours: measurements in a mean of a speed, before its slope is taken
-EXPECTED = (0.1, 0.01)  # [-], [rad] ours: gain and encoder are right within this where no motion shows more
-TRIES, REFINED = 64, 2  # ours: random starts; the best of them, which are followed to the end
-BLOCK = 50  # ours: measurements in a row whose errors may be alike
-NOISE = 1.5  # ours: a residual so small is noise, and no other start is followed
-STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: of the optimiser, in the scale of each number
-SLOW = 0.005  # [s] ours: a log of slower measurements shows neither delay nor armature
-MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.99  # [share], [rad], [share] ours: least motion; jump; what a fit must explain
+ANGLE, SPEED = 0.001, 0.02  # [rad], [rad/s] ours: scale of the residuals, about the noise of an encoder
+HEAVY = 1e6  # [kg], [kg m^2] ours: inertia of the root and of joints with a prescribed motion
+SMOOTH = 9  # ours: window of the moving average [measurements], applied before differentiation
+EXPECTED = (0.1, 0.01)  # [-], [rad] ours: standard deviations of the prior of gain and encoder offset
+TRIES, REFINED = 64, 2  # ours: random starts; number of the best starts that are optimised
+BLOCK = 50  # ours: consecutive measurements whose errors may be correlated
+NOISE = 1.5  # ours: a residual below this is noise, and no other start is optimised
+STEPS, DIFFERENCE, END = 40, 1e-3, 1e-4  # ours: iterations; step and tolerance, in the parameters' scale
+SLOW = 0.005  # [s] ours: slower measurements do not determine delay and armature
+MOVED, JUMP, EXPLAINED = 0.25, 0.1, 0.99  # [-], [rad], [-] ours: smallest motion; jump; explained variance
 
 
 class Parameter(NamedTuple):
-    """A number that is fitted."""
+    """A fitted parameter."""
 
     name: str
     unit: str
     digits: int
-    scale: float  # of a change that matters, for the optimiser
+    scale: float  # a significant change, for the optimiser
     low: float
     high: float
-    start: tuple[float, float]  # of the random starts; of the armature a factor on the scene's
+    start: tuple[float, float]  # range of the random starts; for the armature a factor on the scene's
 
 
 PARAMETERS = (
@@ -70,29 +70,29 @@ _SCALE, _LOW, _HIGH = (np.array([getattr(each, name) for each in PARAMETERS]) fo
 
 
 class Sweep(NamedTuple):
-    """One joint's part of a log, at even times."""
+    """The part of a log with one joint's sweep, resampled at equal time steps."""
 
     joint: int
-    begin: Floats  # (D,) [rad] at the begin
-    time: Floats  # (T,) [s] of measurements
+    begin: Floats  # (D,) [rad] at the start
+    time: Floats  # (T,) [s] of the measurements
     angle: Floats  # (T, D) [rad]
     speed: Floats  # (T, D) [rad/s]
-    slope: Floats  # (T, 6 + D) acceleration of the root in a world without gravity, and of the joints
-    spin: Floats  # (6 + D,) their speeds at the begin
-    sent: Floats  # (S,) [s] of targets
+    slope: Floats  # (T, 6 + D) acceleration of the root without gravity, and of the joints
+    spin: Floats  # (6 + D,) the same speeds at the start
+    sent: Floats  # (S,) [s] times of the targets
     target: Floats  # (S,) [rad]
 
 
 class FittedJoint(NamedTuple):
-    """The numbers of one joint, in the order of PARAMETERS, and how well they replay its sweep."""
+    """The fitted parameters of one joint, in the order of PARAMETERS, and the error of its simulated sweep."""
 
     joint: int
     values: Floats  # (6,)
-    deviation: Floats  # (6,) standard deviation, by the residual and its derivatives
-    before: float  # [rad] RMS of the angle's error with the scene's numbers
-    after: float  # [rad] with the fitted ones
+    deviation: Floats  # (6,) standard deviation, from the residual and its derivatives
+    before: float  # [rad] RMS error of the angle with the scene's parameters
+    after: float  # [rad] with the fitted parameters
     time: Floats  # (T,) [s]
-    angles: Floats  # (3, T) [rad] measured, simulated with the scene's numbers, and with the fitted ones
+    angles: Floats  # (3, T) [rad] measured, simulated with the scene's parameters, simulated with the fitted ones
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Fit:
     contract: Contract
     recording: DriveLog
     joints: list[FittedJoint]
-    seconds: float  # [s] that it took
+    seconds: float  # [s] duration of the fit
 
     @property
     def values(self) -> Floats:
@@ -119,7 +119,7 @@ class Fit:
 
 
 def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = ()) -> Fit:
-    """Fit ``joints`` (default: all) of the log, but those whose names have a part of ``leave_out``.
+    """Fit ``joints`` (default: all) of the log, without those whose names contain a part of ``leave_out``.
 
     Raises LogError, ContractError.
     """
@@ -130,13 +130,13 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
         folder = Path(own) if recording.files else Path(recording.header["export"])
         contract = read_contract(folder)
         if contract.digest != recording.header["network"]:
-            raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)}")
+            raise LogError(f"{shown(path)} was recorded with another network than the one in {shown(folder)}")
         scene = read_scene(folder, contract)
     for part in leave_out:
         if not any(part in name for name in contract.joints):
             raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
-    wanted = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
-    sweeps = read_sweeps(path, recording, contract, scene.model, wanted)
+    selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
+    sweeps = read_sweeps(path, recording, contract, scene.model, selected)
     fitted = [_fit_joint(Chain(scene.spec, contract, sweep)) for sweep in sweeps]
     for each in fitted:
         _check_explained(path, contract.joints[each.joint], each)
@@ -146,15 +146,13 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
 def read_sweeps(
     path: Path, recording: DriveLog, contract: Contract, model: mujoco.MjModel, joints: Sequence[str]
 ) -> list[Sweep]:
-    """The sweeps of ``joints``. Raises LogError for a log without them, or if one cannot be fitted."""
+    """The sweeps of ``joints``. Raises LogError if the log has no chirp or a sweep cannot be fitted."""
     on = recording.rows["state"][:, 0] == STATES.index(CHIRP)
     rows = {name: values[on].astype(float) for name, values in recording.rows.items()}
     if not on.any():
-        raise LogError(f"{shown(path)} holds no chirp: record one with legged-mw deploy EXPORT --robot unitree --chirp")
+        raise LogError(f"{shown(path)} has no chirp: record one with legged-mw deploy EXPORT --robot unitree --chirp")
     if (count := rows["joint_pos"].shape[1]) != len(contract.joints):
-        raise LogError(
-            f"{shown(path)} is of a robot with {count} joints, and its export of one with {len(contract.joints)}"
-        )
+        raise LogError(f"{shown(path)} has {count} joints, and its export has {len(contract.joints)}")
     step = float(np.median(np.diff(rows["time"][:, 0])))
     if not 0.0 < step <= SLOW:
         raise LogError(
@@ -162,14 +160,14 @@ def read_sweeps(
         )
     targets, rest = rows["target"], round(REST / step)
     still = np.flatnonzero((np.diff(targets, axis=0) == 0.0).all(axis=1))
-    begin = int(still[0]) if len(still) else len(targets) - 1  # the pose, of which the sweeps are about
+    begin = int(still[0]) if len(still) else len(targets) - 1  # start of the first sweep
     moved = np.abs(targets - targets[begin]) > 1e-5
     moved[:begin] = False
     sweeps = list[Sweep]()
     for name in joints:
         span = np.flatnonzero(moved[:, contract.joints.index(name)])
         if len(span) < 2 or span[-1] + rest // 2 > len(moved):
-            raise LogError(f"{shown(path)} ends before the sweep of {name} does: record the chirp again")
+            raise LogError(f"{shown(path)} ends before the sweep of {name} ends: record the chirp again")
         part = {key: values[max(0, span[0] - rest) : span[-1] + rest] for key, values in rows.items()}
         _check_joint(path, name, contract.joints.index(name), part, step)
         sweeps.append(_sweep(contract.joints.index(name), part, contract, model, step))
@@ -177,103 +175,103 @@ def read_sweeps(
 
 
 def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], step: float) -> None:
-    """Raise LogError if the encoder is dead, or the joint does not follow its target."""
+    """Raise LogError if the encoder is dead or the joint does not follow its target."""
     target, angle, speed = (rows[key][:, joint] for key in ("target", "joint_pos", "joint_vel"))
     jumps = float(np.abs(np.diff(angle) - step * speed[1:]).max())
-    slow = slice(0, round(1.5 / SLOWEST / step))  # the slowest swings, which each joint can follow
-    went, told = float(np.ptp(angle[slow])), float(np.ptp(target[slow]))
+    slow = slice(0, round(1.5 / SLOWEST / step))  # the slowest oscillations, which each joint can follow
+    moved, commanded = float(np.ptp(angle[slow])), float(np.ptp(target[slow]))
     if not np.isfinite([angle, speed]).all() or not np.ptp(angle) > 0.0:
         why = "its encoder is dead: the angle is the same throughout"
     elif jumps > JUMP:
         why = f"its encoder jumps by {jumps:.2f} rad between two measurements"
-    elif went < MOVED * told:
-        why = f"it went {went:.2f} rad where its target went {told:.2f}: its motor is loose, or it is blocked"
+    elif moved < MOVED * commanded:
+        why = f"it moved by {moved:.2f} rad and its target by {commanded:.2f} rad: its motor is loose, or it is blocked"
     else:
         return
     raise LogError(f"{shown(path)}: {name} cannot be fitted: {why}")
 
 
 def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
-    """Raise LogError if the best numbers do not replay the joint's motion."""
+    """Raise LogError if the simulation with the fitted parameters does not reproduce the joint's motion."""
     explained = max(0.0, 1.0 - fitted.after**2 / float(fitted.angles[0].var()))
     if explained < EXPLAINED:
         raise LogError(
-            f"{shown(path)}: {name} cannot be fitted: the best numbers explain {explained:.1%} of its motion: it is loose, "
+            f"{shown(path)}: {name} cannot be fitted: the fitted parameters explain {explained:.1%} of its motion: it is loose, "
             f"touches something, or carries the robot; --leave_out {name} fits the others"
         )
 
 
 def _sweep(joint: int, rows: dict[str, Floats], contract: Contract, model: mujoco.MjModel, step: float) -> Sweep:
-    """One joint's rows at even times, each at the time when it was measured, or sent."""
+    """One joint's rows, resampled at equal time steps, with the times of measuring and of sending."""
     begins = rows["time"][:, 0] + rows["behind"][:, 0]
     measured = begins - np.nan_to_num(rows["age"][:, 0])
-    sent = begins + np.append(rows["work"][1:, 0], rows["work"][-1:, 0])  # a row has the work of the step before
+    sent = begins + np.append(rows["work"][1:, 0], rows["work"][-1:, 0])  # a row has the work of the previous step
     times = np.arange(measured[0], measured[-1], step)
     names = ("joint_pos", "joint_vel", "ang_vel", "acceleration")
-    angle, speed, gyro, felt = (
+    angle, speed, gyro, acceleration = (
         np.stack([np.interp(times, measured, column) for column in rows[name].T], axis=1) for name in names
     )
-    root, turn = _root_motion(contract, model, _even(gyro), felt, step)
-    slope = np.concatenate([root, _change(_even(speed)) / step], axis=1)
-    spin = np.concatenate([np.zeros(3), turn, _even(speed)[0]])
-    way, rest = step * np.cumsum(_even(speed), axis=0), round(REST / step)
-    begin = (angle - way + way[0])[:rest].mean(axis=0)
+    root, angular_velocity = _root_motion(contract, model, _smooth(gyro), acceleration, step)
+    slope = np.concatenate([root, _difference(_smooth(speed)) / step], axis=1)
+    spin = np.concatenate([np.zeros(3), angular_velocity, _smooth(speed)[0]])
+    distance, rest = step * np.cumsum(_smooth(speed), axis=0), round(REST / step)
+    begin = (angle - distance + distance[0])[:rest].mean(axis=0)
     target = rows["target"][:, joint]
     return Sweep(joint, begin, times - times[0], angle, speed, slope, spin, sent - times[0], target)
 
 
-def _even(values: Floats) -> Floats:
-    """Means over SMOOTH rows of (T, K)."""
+def _smooth(values: Floats) -> Floats:
+    """Moving average over SMOOTH rows of (T, K)."""
     padded, window = np.pad(values, ((SMOOTH // 2, SMOOTH // 2), (0, 0)), "edge"), np.ones(SMOOTH) / SMOOTH
     return np.stack([np.convolve(column, window, "valid") for column in padded.T], axis=1)
 
 
-def _change(values: Floats) -> Floats:
-    """Of each row to the next one (T, K); the last row's is 0."""
+def _difference(values: Floats) -> Floats:
+    """Difference of each row to the next row (T, K). The last one is 0."""
     return np.diff(values, axis=0, append=values[-1:])
 
 
 def _root_motion(
-    contract: Contract, model: mujoco.MjModel, gyro: Floats, felt: Floats, step: float
+    contract: Contract, model: mujoco.MjModel, gyro: Floats, acceleration: Floats, step: float
 ) -> tuple[Floats, Floats]:
-    """(T, 6) acceleration of the root in a world without gravity, in which it begins level; (3,) its first spin.
+    """(T, 6) acceleration of the root without gravity, starting level; (3,) its angular velocity at the start.
 
-    ``gyro`` and ``felt`` (T, 3): of the IMU, its frame. Linear in the world frame, angular in the body's.
+    ``gyro`` and ``felt`` (T, 3): gyro and accelerometer, IMU frame. Linear: world frame. Angular: body frame.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     data.qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     mujoco.mj_kinematics(model, data)
-    place, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
+    position, turn = data.site(contract.imu).xpos, data.site(contract.imu).xmat.reshape(3, 3)
     omega = gyro @ turn.T
-    turning = _change(omega) / step
-    felt = np.append(felt[1:], felt[-1:], axis=0)  # an IMU says what it felt since the measurement before
-    own = felt @ turn.T - np.cross(turning, place) - np.cross(omega, np.cross(omega, place))
-    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(own)
+    angular_acceleration = _difference(omega) / step
+    acceleration = np.append(acceleration[1:], acceleration[-1:], axis=0)  # mean since the last row
+    root = acceleration @ turn.T - np.cross(angular_acceleration, position) - np.cross(omega, np.cross(omega, position))
+    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(root)
     for i, after in enumerate(np.append(omega[1:], omega[-1:], axis=0)):
         mujoco.mju_quat2Mat(rotation, quaternion)
-        world[i] = rotation.reshape(3, 3) @ own[i]
+        world[i] = rotation.reshape(3, 3) @ root[i]
         mujoco.mju_quatIntegrate(quaternion, after, step)
-    return np.concatenate([world, turning], axis=1), omega[0]
+    return np.concatenate([world, angular_acceleration], axis=1), omega[0]
 
 
 # ---- the replay
 
 
 class Chain:
-    """A sweep's joint in MuJoCo, with what hangs on it and what it hangs on."""
+    """A MuJoCo model of a sweep's joint, of the bodies that it moves and of the bodies that carry it."""
 
     def __init__(self, spec: mujoco.MjSpec, contract: Contract, sweep: Sweep) -> None:
         name = contract.joints[sweep.joint]
         self.sweep, self.model = sweep, (model := _only_chain(spec, name))
         self._gains = np.array([contract.stiffness[sweep.joint], contract.damping[sweep.joint]])
-        self._all = [i for i, each in enumerate(contract.joints) if _has_joint(model, each)]  # in the contract
+        self._all = [i for i, each in enumerate(contract.joints) if _has_joint(model, each)]  # index in the contract
         self._dofs = np.array([model.joint(contract.joints[i]).dofadr[0] for i in self._all])
         self._angles = np.array([model.joint(contract.joints[i]).qposadr[0] for i in self._all])
         joint, self._actuator = model.joint(name), model.actuator(name).id
         self._dof, self._angle = int(joint.dofadr[0]), int(joint.qposadr[0])
         own = [0.0, model.dof_armature[self._dof], model.dof_frictionloss[self._dof], 0.0, 1.0, 0.0]
-        self.nominal: Floats = np.array(own)  # (6,) the scene's
+        self.nominal: Floats = np.array(own)  # (6,) the scene's parameters
         self._mobility = float(model.dof_invweight0[self._dof])  # [1 / (kg m^2)]
         model.opt.timestep, model.opt.integrator = sweep.time[1], mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model.opt.iterations, model.opt.ls_iterations, model.opt.gravity[:] = 100, 50, 0.0
@@ -286,15 +284,15 @@ class Chain:
         self._rollout, self._data = Rollout(nthread=threads), [mujoco.MjData(model) for _ in range(threads)]
 
     def simulate(self, values: Floats) -> tuple[Floats, Floats]:
-        """What the joint's encoder says, angles and speeds (K, T), with ``values`` (K, 6)."""
-        sweep, model, told = self.sweep, self.model, [*range(6), *(6 + i for i in self._all)]
+        """Simulated encoder angles and speeds (K, T) with the parameters ``values`` (K, 6)."""
+        sweep, model, columns = self.sweep, self.model, [*range(6), *(6 + i for i in self._all)]
         control = np.zeros((len(values), len(sweep.time), model.nu + model.nv))
-        pushed = [model.nu + dof for dof in (*range(6), *self._dofs)]
-        control[:, :, pushed] = HEAVY * sweep.slope[:, told]
+        forces = [model.nu + dof for dof in (*range(6), *self._dofs)]
+        control[:, :, forces] = HEAVY * sweep.slope[:, columns]
         control[:, :, model.nu + self._dof] = 0.0
         start = np.zeros((len(values), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
-        start[:, 4], qvel = 1.0, 1 + model.nq  # after the time: place, attitude, angles, speeds
-        start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[told]
+        start[:, 4], qvel = 1.0, 1 + model.nq  # a state is time, position, attitude, angles, speeds
+        start[:, [qvel + dof for dof in (*range(6), *self._dofs)]] = sweep.spin[columns]
         start[:, 1 + self._angles] = sweep.begin[self._all]
         start[:, 1 + self._angle] -= values[:, OFFSET]
         for k, numbers in enumerate(values):
@@ -307,13 +305,13 @@ class Chain:
         return states[..., 1 + self._angle] + values[:, OFFSET:], states[..., qvel + self._dof]
 
     def _with(self, numbers: Floats) -> mujoco.MjModel:
-        """The model with the numbers (6,) of its joint."""
+        """The model with the parameters (6,) of its joint."""
         model, (stiffness, damping) = copy.copy(self.model), numbers[GAIN] * self._gains
         model.dof_armature[self._dof], model.dof_frictionloss[self._dof] = numbers[ARMATURE], numbers[FRICTION]
         model.dof_damping[self._dof] = numbers[DAMPING]
-        # MuJoCo's friction is as soft as the joint's inverse inertia, which the armature changes
-        gained = numbers[ARMATURE] - self.nominal[ARMATURE]
-        model.dof_invweight0[self._dof] = self._mobility / (1.0 + self._mobility * gained)
+        # MuJoCo scales the softness of friction by the joint's inverse inertia, which the armature changes
+        added = numbers[ARMATURE] - self.nominal[ARMATURE]
+        model.dof_invweight0[self._dof] = self._mobility / (1.0 + self._mobility * added)
         model.actuator_gainprm[self._actuator, 0] = stiffness
         model.actuator_biasprm[self._actuator, 1:3] = -stiffness, -damping
         return model
@@ -324,13 +322,13 @@ def _has_joint(model: mujoco.MjModel, name: str) -> bool:
 
 
 def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
-    """The robot without the bodies that neither hang on ``joint`` nor carry it; they do not move it."""
+    """Compile the robot without the bodies that ``joint`` does not move and that do not carry it."""
     spec = spec.copy()
-    body, aside = spec.joint(joint).parent, list[Any]()
+    body, others = spec.joint(joint).parent, list[Any]()
     while (parent := body.parent).name != spec.worldbody.name:
-        aside += [each for each in parent.bodies if each.name != body.name]
+        others += [each for each in parent.bodies if each.name != body.name]
         body = parent
-    for each in [*spec.sensors, *spec.keys, *aside]:
+    for each in [*spec.sensors, *spec.keys, *others]:
         spec.delete(each)
     return spec.compile()
 
@@ -339,52 +337,52 @@ def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:
 
 
 def _fit_joint(chain: Chain) -> FittedJoint:
-    """Fit one joint from the best of random starts."""
+    """Fit one joint. The optimisation starts from the best of the random starts."""
     sweep, joint = chain.sweep, chain.sweep.joint
     angle, speed = sweep.angle[:, joint], sweep.speed[:, joint]
     measured = np.concatenate([angle / ANGLE, speed / SPEED])
 
     def residual(points: Floats) -> Floats:
-        """(2 T + 2, K) of points (6, K) in the optimiser's scale; the last two, by EXPECTED, count as BLOCK each."""
+        """(2 T + 2, K) of scaled parameters (6, K). The last two are the prior EXPECTED, weighted like BLOCK rows."""
         numbers = points.T * _SCALE
-        found = chain.simulate(numbers)
-        missed = np.concatenate([found[0] / ANGLE, found[1] / SPEED], axis=1) - measured
-        off = (numbers[:, GAIN:] - [1.0, 0.0]) / EXPECTED * BLOCK**0.5
-        return np.nan_to_num(np.concatenate([missed, off], axis=1), nan=1e6).T
+        simulated = chain.simulate(numbers)
+        errors = np.concatenate([simulated[0] / ANGLE, simulated[1] / SPEED], axis=1) - measured
+        prior = (numbers[:, GAIN:] - [1.0, 0.0]) / EXPECTED * BLOCK**0.5
+        return np.nan_to_num(np.concatenate([errors, prior], axis=1), nan=1e6).T
 
-    many = _starts(chain.nominal)
-    starts = many[np.argsort((residual((many / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
+    candidates = _starts(chain.nominal)
+    starts = candidates[np.argsort((residual((candidates / _SCALE).T) ** 2).sum(axis=0))[:REFINED]]
     bounds = [_LOW / _SCALE, _HIGH / _SCALE]
-    ends = list[tuple[float, Floats]]()
+    results = list[tuple[float, Floats]]()
     for start in starts / _SCALE:
-        end, trace = minimize.least_squares(
+        result, trace = minimize.least_squares(
             start, residual, bounds, eps=DIFFERENCE, xtol=END, max_iter=STEPS, x_scale="jac", verbose=0
         )
-        ends.append((float(trace[-1].objective), end[:, None]))
-        if ends[-1][0] < 0.5 * NOISE**2 * len(measured):
+        results.append((float(trace[-1].objective), result[:, None]))
+        if results[-1][0] < 0.5 * NOISE**2 * len(measured):
             break
-    best = min(ends, key=lambda each: each[0])[1]
-    error = residual(best)
-    slopes, _ = minimize.jacobian_fd(
-        residual, best, error, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
+    best = min(results, key=lambda each: each[0])[1]
+    residuals = residual(best)
+    jacobian, _ = minimize.jacobian_fd(
+        residual, best, residuals, np.float64(DIFFERENCE), 0, [each[:, None] for each in bounds]
     )
-    deviation = _deviation(slopes, error[:, 0])
-    found = best[:, 0] * _SCALE
-    angles = np.stack([angle, *chain.simulate(np.stack([chain.nominal, found]))[0]])
+    deviation = _deviation(jacobian, residuals[:, 0])
+    fitted = best[:, 0] * _SCALE
+    angles = np.stack([angle, *chain.simulate(np.stack([chain.nominal, fitted]))[0]])
     before, after = np.sqrt(((angles[1:] - angle) ** 2).mean(axis=1)).tolist()
-    return FittedJoint(joint, found, deviation * _SCALE, before, after, sweep.time, angles)
+    return FittedJoint(joint, fitted, deviation * _SCALE, before, after, sweep.time, angles)
 
 
-def _deviation(slopes: Floats, error: Floats) -> Floats:
-    """Standard deviations (6,) by errors (R,) and their ``slopes`` (R, 6), as if BLOCK rows in a row had one error."""
-    size = np.linalg.norm(slopes, axis=0)
-    slopes = slopes / size
+def _deviation(jacobian: Floats, error: Floats) -> Floats:
+    """Standard deviations (6,) from residuals (R,) and derivatives (R, 6). BLOCK consecutive rows count as one."""
+    size = np.linalg.norm(jacobian, axis=0)
+    jacobian = jacobian / size
     variance = BLOCK * float(error @ error) / (len(error) - len(size))
-    return np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes))) / size
+    return np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian))) / size
 
 
 def _starts(nominal: Floats) -> Floats:
-    """Random starts (TRIES, 6); the scene's armature times a factor."""
+    """Random starts (TRIES, 6). The armature is a factor times the scene's."""
     low, high = np.array([each.start for each in PARAMETERS]).T
     share = np.random.default_rng(0).random((TRIES, len(PARAMETERS)))
     starts = low + share * (high - low)
@@ -392,11 +390,11 @@ def _starts(nominal: Floats) -> Floats:
     return starts
 
 
-# ---- what is written
+# ---- output
 
 
 def table(fit: Fit) -> str:
-    """A line per joint: each number with its standard deviation, and the angle's error before and after."""
+    """One line per joint: parameters with standard deviations, and the angle's error before and after the fit."""
     names = [fit.contract.joints[each.joint] for each in fit.joints]
     width = max(map(len, names))
     heads = [f"{each.name} [{each.unit}]" for each in PARAMETERS]
@@ -408,12 +406,12 @@ def table(fit: Fit) -> str:
         ]
         errors = f"{1e3 * each.before:.1f} -> {1e3 * each.after:.1f}"
         lines.append("".join([f"{name:<{width}}", *(f"{cell:>20}" for cell in cells), f"{errors:>18}"]))
-    said = fit.recording.header
-    return "\n".join([*lines, f"{said['task']}, {said['robot']}, {said['began']}; fitted in {fit.seconds:.0f} s"])
+    header = fit.recording.header
+    return "\n".join([*lines, f"{header['task']}, {header['robot']}, {header['began']}; fitted in {fit.seconds:.0f} s"])
 
 
 def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
-    """Fields of the task's config: the numbers of each kind of joint, and ranges that hold each joint's own.
+    """Fields of the task's config: means over joints of the same kind, and ranges that include each joint's value.
 
     A range is two standard deviations wider on each side.
     """
@@ -421,10 +419,10 @@ def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
     kinds = _kinds([fit.contract.joints[each.joint] for each in fit.joints])
     tables, ranges = dict[str, dict[str, float]](), dict[str, list[float]]()
     for field, column in (("armature", ARMATURE), ("frictionloss", FRICTION)):
-        found, off = values[:, column], deviation[:, column]
-        tables[field] = {kind: _short(found[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
+        fitted, spread = values[:, column], deviation[:, column]
+        tables[field] = {kind: _short(fitted[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
         mean = np.maximum([tables[field][kind] for kind in kinds], 1e-6)
-        ranges[field] = _range(found / mean, off / mean, 1e-3)
+        ranges[field] = _range(fitted / mean, spread / mean, 1e-3)
     ranges["stiffness"] = _range(values[:, GAIN], deviation[:, GAIN], 1e-3)
     own = fit.contract.damping[[each.joint for each in fit.joints]]
     if own.all():
@@ -436,9 +434,11 @@ def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
 
 
 def _kinds(joints: Sequence[str]) -> list[str]:
-    """The part of each name that a joint shares with those of other sides: hip_joint of FL_hip_joint."""
-    rests = [name.partition("_")[2] for name in joints]
-    return [rest if rest and rests.count(rest) > 1 else name for name, rest in zip(joints, rests, strict=True)]
+    """The part of each name that is the same for all sides: hip_joint of FL_hip_joint."""
+    suffixes = [name.partition("_")[2] for name in joints]
+    return [
+        suffix if suffix and suffixes.count(suffix) > 1 else name for name, suffix in zip(joints, suffixes, strict=True)
+    ]
 
 
 def _range(values: Floats, deviation: Floats, least: float) -> list[float]:
@@ -454,7 +454,7 @@ LINES = {"measured": ("0.75", 3.0), "by the scene's numbers": ("C1", 0.9), "fitt
 
 
 def draw(fit: Fit, path: Path) -> None:
-    """Write the picture: each joint as measured, with the scene's numbers and with the fitted ones."""
+    """Write the picture: the angles of each joint, measured, with the scene's parameters and with the fitted ones."""
     try:
         from matplotlib.figure import Figure
     except ImportError:

@@ -213,7 +213,7 @@ def condition_figures(result: Mapping[str, Any]) -> list[Figure]:
     return [
         Figure("falls in commands under conditions", falls, 0, 0),
         Figure("pushes under all survived", result["conditions"][hard.ALL]["pushes"], 2, hard.PUSHES, None, True),
-        Figure("falls while it is looked at", float(result["looks"] is None), 0, 0),
+        Figure("falls in the gait measurement", float(result["looks"] is None), 0, 0),
     ]
 
 

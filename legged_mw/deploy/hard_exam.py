@@ -24,7 +24,7 @@ from legged_mw.eval.walking import GRAVITY, ExamRules
 from legged_mw.utils.commands import VELOCITY
 
 LOOK_SECONDS = 10.0  # [s] duration of the gait measurement, with the settling time
-PICTURES, WIDTH, HEIGHT = 6, 240, 260  # pictures of one stride; [px] size of each
+PICTURES, WIDTH, HEIGHT = 6, 240, 260  # number of pictures of one stride; [px] size of each
 SEED = 1  # seed of the noise
 
 

@@ -60,7 +60,7 @@ class JointCheck(States):
         """Raises RobotError if the robot cannot change its gains."""
         if not robot.can_change_gains:
             raise RobotError(
-                f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved"
+                f"--check_joints needs low gains, and {type(robot).__name__} cannot change its gains: no joint was moved"
             )
         rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[JointResult]()
         super().__init__(controller, sources, lambda _: rest, say)

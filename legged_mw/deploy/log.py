@@ -221,13 +221,13 @@ def read_log(path: Path) -> DriveLog:
         events = [(float(now), str(text)) for block in blocks for now, text in json.loads(str(block["events"]))]
         readable = header["format"] == FORMAT
     except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror}; a robot that is driven writes logs to {LOGS}") from None
+        raise LogError(f"cannot read {path}: {error.strerror}; a driven robot writes its logs to {LOGS}") from None
     except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
-        raise LogError(f"{path} is no log of legged_mw.deploy") from None
+        raise LogError(f"{path} is not a log of legged_mw.deploy") from None
     if not readable:
         raise LogError(f"{path} is a log of format {header['format']}; this version reads {FORMAT}")
     if not rows:
-        raise LogError(f"{path} holds no step: its run ended within the first {CHUNK}, or was cut off")
+        raise LogError(f"{path} has no step: its run ended within the first {CHUNK} steps, or was interrupted")
     return DriveLog(header, files, rows, events)
 
 

@@ -61,11 +61,11 @@ def _replay(path: Path, recording: DriveLog, folder: Path, edited: bool) -> Repl
     contract = read_contract(folder, edited)
     if contract.digest != recording.header["network"]:
         raise LogError(
-            f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export"
+            f"{shown(path)} was recorded with another network than the one in {shown(folder)} ({recording.header['task']}); name its export"
         )
     walk = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
     if walk.stop - walk.start < SHORTEST:
-        raise LogError(f"{shown(path)} holds no walk of {SHORTEST} steps: the policy was not on for so long")
+        raise LogError(f"{shown(path)} has no walk of {SHORTEST} steps: the policy ran for less time")
     rows = {name: values[walk].astype(float) for name, values in recording.rows.items()}
     return Replay(contract, recording, rows, _simulate(folder, contract, rows))
 

@@ -128,7 +128,7 @@ class _Step:
         )
         self.summary, self.odometry = Summary(), odometry
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
-            raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
+            raise RobotError(f"{type(robot).__name__} does not override damp() and limp(), which the states need")
         if states and controller.contract.action.origin == TORQUE:
             reason = "a policy of torques cannot stand a robot up: its states need servos"
             raise RobotError(f"{reason}; run it without states, or watch it in simulation without --drive")

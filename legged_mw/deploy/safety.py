@@ -1,4 +1,4 @@
-"""Safety limits between a policy and a robot. They are checked every step. An exceeded limit gives a `Trip`.
+"""Safety limits between a policy and a robot, checked in every step. An exceeded limit gives a `Trip`.
 
 The caller of `Safety` damps the robot. This module moves no joint, reads no clock and depends on no type of robot.
 """
@@ -142,7 +142,7 @@ def limits_of(model: Any, contract: Contract) -> Limits:
     return Limits(low, high, np.minimum(servo, joint), contract.action.lowest, contract.action.highest)
 
 
-class _Seen(NamedTuple):
+class _Signals(NamedTuple):
     """The motion signals of one measurement, and the servos' previous target. Of N measurements each is (N, ...)."""
 
     joint_pos: Floats
@@ -167,12 +167,14 @@ class Safety:
         """Forget all steps, for a new start of the robot."""
         self._last: Floats | None = None  # (D,) targets of the previous step, before clipping
         self._held: Floats | None = None  # (D,) the same after clipping
-        self._seen = deque[_Seen](
+        self._seen = deque[_Signals](
             maxlen=max(1, math.ceil(_ALONE * self.limits.frozen)) if self.limits.frozen < OFF else 1
         )
-        self._same = dict.fromkeys(_Seen._fields[:4], 0)  # sensor -> consecutive identical values
+        self._same = dict.fromkeys(_Signals._fields[:4], 0)  # sensor -> consecutive identical values
         self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) consecutive identical angles
-        self._lived = set[str]()  # sensors except joint_pos that changed at least once; a missing sensor never changes
+        self._changed = set[
+            str
+        ]()  # sensors except joint_pos that changed at least once; a missing sensor never changes
         self._late: deque[float] = deque()  # [s] times of late steps within the last second
         self._remote: float | None = None  # [s] time at which the remote was last received
 
@@ -228,13 +230,14 @@ class Safety:
     def _finite(self, measured: Measurement) -> Trip | None:
         for name in ("joint_pos", "joint_vel", "gravity", "ang_vel"):
             if not np.isfinite(getattr(measured, name)).all():
-                return Trip("finite", f"what is measured is not finite: {name}")
+                return Trip("finite", f"a measured value is not finite: {name}")
         for name, (most, unit) in _ABSURD.items():
             if (value := np.abs(getattr(measured, name)).max()) > most:
-                return Trip("finite", f"what is measured cannot be: {name} of {value:.3g} {unit}")
+                return Trip("finite", f"a measured value is impossible: {name} of {value:.3g} {unit}")
         if abs((length := float(np.linalg.norm(measured.gravity))) - 1.0) > _UNIT:
             return Trip(
-                "finite", f"what is measured cannot be: gravity of length {length:.2f}, not 1: no orientation comes"
+                "finite",
+                f"a measured value is impossible: gravity of length {length:.2f}, not 1: the IMU sends no orientation",
             )
         return None
 
@@ -250,26 +253,26 @@ class Safety:
         """Trip if the measurement is frozen, or one sensor is frozen while others measure motion."""
         target = measured.joint_pos if self._held is None else self._held
         parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, target
-        signals = _Seen(*map(np.array, parts))  # copies: a robot may reuse its arrays
+        signals = _Signals(*map(np.array, parts))  # copies: a robot may reuse its arrays
         previous = self._seen[-1] if self._seen else signals
         self._seen.append(signals)
         self._stuck = np.where(signals.joint_pos == previous.joint_pos, self._stuck + 1, 1)
         self._same["joint_pos"] = int(self._stuck.min())
-        for i, name in enumerate(_Seen._fields[1:4], start=1):
+        for i, name in enumerate(_Signals._fields[1:4], start=1):
             self._same[name] = self._same[name] + 1 if signals[i].tobytes() == previous[i].tobytes() else 1
             if signals is not previous and self._same[name] == 1:
-                self._lived.add(name)
+                self._changed.add(name)
         if (count := min(self._same[name] for name in ("joint_pos", "joint_vel", "ang_vel"))) >= self.limits.frozen:
             return Trip("frozen", f"{count} measurements in a row are the same")
         stuck = self._stuck >= _ALONE * self.limits.frozen
         frozen = [
-            name for name in ("joint_pos", *sorted(self._lived)) if self._same[name] >= _ALONE * self.limits.frozen
+            name for name in ("joint_pos", *sorted(self._changed)) if self._same[name] >= _ALONE * self.limits.frozen
         ]
         return self._contradicted(frozen, stuck) if frozen or stuck.any() else None
 
     def _contradicted(self, frozen: list[str], stuck: Any) -> Trip | None:
         """Trip on the first sensor of ``frozen`` or joint of ``stuck`` (D,) that moved according to other sensors."""
-        seen = _Seen(*map(np.array, zip(*self._seen, strict=True)))
+        seen = _Signals(*map(np.array, zip(*self._seen, strict=True)))
         count, period = len(seen.joint_pos), self.contract.period
         # a joint needs time to follow the newest targets
         by_target = np.ptp(seen.target[: count - count // 3], axis=0)

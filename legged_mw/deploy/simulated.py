@@ -482,14 +482,14 @@ def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Raise ValueError if the first keyframe is not a valid start pose."""
     # without it, `size nkey` gives the model a keyframe of straight legs
     if not spec.keys or not len(spec.keys[0].qpos):
-        raise ValueError("it has no keyframe; the first one says where the robot starts")
+        raise ValueError("it has no keyframe; the first keyframe is the start pose")
     if not np.any(model.opt.gravity):
-        raise ValueError("it has no gravity, so no direction is down")
+        raise ValueError("it has no gravity")
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     if not 0.9 < np.linalg.norm(data.qpos[3:7]) < 1.1 or np.abs(data.qpos).max() > _FAR:
         raise ValueError(
-            "its first keyframe is no pose: the root's quaternion has not length 1, or a value is enormous"
+            "its first keyframe is not a pose: the root's quaternion does not have length 1, or a value is too large"
         )
     mujoco.mj_forward(model, data)
     depths = [contact.dist for contact in data.contact if 0 in model.body_weldid[model.geom_bodyid[contact.geom]]]

@@ -1,1 +1,1 @@
-"""Environments: the MDP in torch, on top of the simulator seam."""
+"""Environments: the MDP in torch. It uses the simulator only through the interface in sim/."""

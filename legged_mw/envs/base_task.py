@@ -75,8 +75,8 @@ class BaseTask(VecEnv):
         Where done is true, the environment is already reset and its observation is the first of the next episode.
         """
         if actions.shape != self.actions.shape:
-            wanted, got = tuple(self.actions.shape), tuple(actions.shape)
-            raise ValueError(f"actions must be {wanted} (environments, joints); got {got}")
+            expected, actual = tuple(self.actions.shape), tuple(actions.shape)
+            raise ValueError(f"actions must be {expected} (environments, joints); got {actual}")
         with torch.inference_mode():  # faster temporary tensors; the fixed buffers stay normal tensors
             self.actions.copy_(actions)
             self._graph()

@@ -1,6 +1,6 @@
 """A legged robot that walks by command: commands, feet, ground and their curricula, read top to bottom.
 
-Acting, sensing the base and joints, resets and the reward machinery are in ``robot_task``, and its rules hold here too.
+Actions, base and joint state, resets and the reward machinery are in ``robot_task``. Its rules also hold here.
 The reward terms are at the end. Shapes: N environments, C commands, F feet.
 
 Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym; [UL] unitree_rl_lab; [I] Isaac Lab's
@@ -35,7 +35,7 @@ PHASE_SIGMA = 0.01  # [m^2] of feet_phase: an error of 0.1 m in height gives 1/e
 
 
 class LeggedRobot(RobotTask):
-    """N legged robots that follow commands (N, C): vx, vy, yaw rate, and what a task adds to ``commands.ranges``."""
+    """N legged robots that follow commands (N, C): vx, vy, yaw rate, and those that a task adds to its ranges."""
 
     cfg: LeggedRobotCfg
     exam = "walking"
@@ -59,7 +59,7 @@ class LeggedRobot(RobotTask):
         self.is_commanded(out=self.moving)
 
     def is_commanded(self, out: Tensor | None = None) -> Tensor:
-        """(N,) The velocity command is to move, not to stand; written into ``out`` if given."""
+        """(N,) True if the velocity command is to move, not to stand; written into ``out`` if given."""
         return torch.gt(self.velocity_command.square().sum(dim=1), self.cfg.rewards.min_command**2, out=out)
 
     def _end_step(self) -> None:
@@ -79,7 +79,7 @@ class LeggedRobot(RobotTask):
                 self._steer_to_heading()
 
     def _timed_out(self) -> Tensor:
-        """(N,) Out of time, or off the terrain, which is no fall."""
+        """(N,) True at the time limit, or off the terrain, which is not a fall."""
         over = super()._timed_out()
         if self.tiles:
             torch.gt((self.root_pos[:, :2].abs() - self.tiles.edge).amax(dim=1), 0.0, out=self.walked_off)
@@ -87,11 +87,11 @@ class LeggedRobot(RobotTask):
         return over
 
     def _reset_task(self, mask: Tensor) -> None:
-        """New commands, feet in the air."""
+        """Draw new commands, and clear the feet's contacts and heights."""
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
         if self.cfg.observations.foot_height:
-            self.foot_height.masked_fill_(mask[:, None], 0.0)  # not that of the last episode
+            self.foot_height.masked_fill_(mask[:, None], 0.0)  # remove the last episode's values
         if self.feet.forces is not None:
             self.feet.forces.masked_fill_(mask[:, None, None], 0.0)
         if self.gait:
@@ -100,7 +100,7 @@ class LeggedRobot(RobotTask):
     # ---- ground -----------------------------------------------------------------------------------------------------
 
     def _measure_ground(self) -> None:
-        """Feet, their heights and the root's above the ground, and how far the robot walked."""
+        """Measure the heights of feet and root above the ground, and the walked distance."""
         torch.index_select(self.sim.site_xpos, 1, self.foot_sites, out=self.foot_pos)
         if not (self.tiles and self._height_at):
             return  # on a plane foot_height is the z of foot_pos
@@ -117,7 +117,7 @@ class LeggedRobot(RobotTask):
         torch.maximum(self.max_distance, away, out=self.max_distance)
 
     def _scan_heights(self) -> None:
-        """The height scan [m]: 0 where the robot stands on level ground, positive for lower ground, within 1 m."""
+        """Measure the height scan [m]: 0 for standing on level ground, positive for lower ground, clipped to 1 m."""
         root, yaw = self.root_pos, yaw_of(self.root_quat)
         cos, sin = torch.cos(yaw)[:, None], torch.sin(yaw)[:, None]
         px, py = self.scan_points
@@ -128,7 +128,7 @@ class LeggedRobot(RobotTask):
         self.height_scan.copy_(level.clamp(-1.0, 1.0).expand_as(self.height_scan))
 
     def _start_places(self, offset: Tensor) -> Tensor:
-        """On the world's tile, (N, 3) [m, world]."""
+        """Root position at reset (N, 3) [m, world], on the world's tile."""
         if not self.tiles:
             return super()._start_places(offset)
         place = self.init_pos + self.tiles.origins
@@ -138,7 +138,7 @@ class LeggedRobot(RobotTask):
         return torch.cat([at, height], dim=1)
 
     def _update_curricula(self, mask: Tensor) -> None:
-        """Kicks, terrain levels and command ranges."""
+        """Update the curricula of kicks, terrain levels and command ranges."""
         super()._update_curricula(mask)
         if self.tiles:
             self._update_terrain_curriculum(mask)
@@ -146,14 +146,14 @@ class LeggedRobot(RobotTask):
             self._update_command_curriculum(mask)
 
     def _share_survived(self) -> Tensor:
-        """(N,) Leaving the terrain ends an episode early, but is no fall."""
+        """(N,) The share of the episode without a fall: 1 if the robot left the terrain, which is not a fall."""
         share = self.episode_steps[:, 0] / self.max_episode_length
         return torch.where(self.walked_off, share, super()._share_survived())
 
     def _update_terrain_curriculum(self, mask: Tensor) -> None:
-        """One level up where the robot left its tile; one down if it walked less than half the commanded distance. [L]
+        """Go up one level if the robot left its tile; down if it walked less than half the commanded distance. [L]
 
-        A robot that fell also owes the distance of its last command until the end of the episode.
+        After a fall, the commanded distance includes the rest of the episode at the last command.
         """
         assert self.tiles
         left = (self.max_episode_length - self.episode_steps[:, 0]).clamp(min=0.0) * self.dt
@@ -165,13 +165,13 @@ class LeggedRobot(RobotTask):
     # ---- commands ---------------------------------------------------------------------------------------------------
 
     def _reset_commands(self, mask: Tensor) -> None:
-        """A new episode's command is drawn from the ranges, none at rest."""
+        """Draw the command of a new episode from the ranges, never the command to stand."""
         assign(self.commands, mask, self._new_commands())
         assign(self.command_timer, mask, self._draw_timers())
         self._draw_heading(mask)
 
     def _resample_commands(self, mask: Tensor) -> None:
-        """Where a timer ended a command keeps its value, or gets its default (velocities 0) or a new value."""
+        """At the end of a timer, keep each value, set it to its default (velocities 0), or draw a new one."""
         count = len(self.command_table)
         chance = torch.rand(self.num_envs, 2 * count, device=self.device)
         fresh = torch.where(chance[:, :count] < self.keep_probability, self._new_commands(), self.rest_command)
@@ -181,7 +181,7 @@ class LeggedRobot(RobotTask):
         self._draw_heading(mask)
 
     def _draw_heading(self, mask: Tensor) -> None:
-        """A new heading where ``mask`` (N,) is true, and its yaw rate; not if the caller gives the commands. [L]"""
+        """Draw a heading, and compute its yaw rate, where ``mask`` (N,) is true; not for a caller's commands. [L]"""
         commands = self.cfg.commands
         if commands.heading_command and commands.resampling_time > 0:
             low, high = commands.ranges.heading
@@ -189,13 +189,13 @@ class LeggedRobot(RobotTask):
             self._steer_to_heading()
 
     def _steer_to_heading(self) -> None:
-        """The yaw rate is proportional to the heading error, within its range. [L]"""
+        """Set the yaw rate proportional to the heading error, within its range. [L]"""
         error = wrap_to_pi(self.heading - yaw_of(self.root_quat))
         low, high = self.command_ranges[:, 2]
         self.commands[:, 2] = (self.cfg.commands.heading_gain * error).clamp(low, high)
 
     def _new_commands(self) -> Tensor:
-        """(N, C) Uniform over the ranges; at one of the ends with ``commands.end_probability``."""
+        """(N, C) Commands, uniform in the ranges, or at an end of the range with ``commands.end_probability``."""
         (low, high), place = self.command_ranges, torch.rand_like(self.commands)
         if self.cfg.commands.end_probability:
             at_end = torch.rand_like(self.commands) < self.cfg.commands.end_probability
@@ -203,12 +203,12 @@ class LeggedRobot(RobotTask):
         return torch.lerp(low, high, place)
 
     def _draw_timers(self) -> Tensor:
-        """Exponential, (N, 1), rounded to control steps."""
+        """(N, 1) Timers from an exponential distribution, rounded to control steps."""
         mean = self.cfg.commands.resampling_time / self.dt
         return torch.empty(self.num_envs, 1, device=self.device).exponential_().mul_(mean).round_()
 
     def _update_command_curriculum(self, mask: Tensor) -> None:
-        """Every N ended episodes: wider ranges, if they tracked the velocity well. [L]"""
+        """After every N episodes, widen the ranges if the velocity was tracked well. [L]"""
         share, total, count = self.command_curriculum  # each ()
         term = self.reward_names.index("tracking_lin_vel")
         best = self.reward_scales[term] * self.episode_steps[:, 0]
@@ -223,7 +223,7 @@ class LeggedRobot(RobotTask):
         self._set_command_ranges()
 
     def _set_command_ranges(self) -> None:
-        """Shrink the ranges of the commands to the curriculum's share, around their defaults."""
+        """Set the command ranges to the curriculum's share, around the defaults."""
         torch.lerp(self._narrowest, self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
 
     # ---- observations -----------------------------------------------------------------------------------------------
@@ -237,7 +237,7 @@ class LeggedRobot(RobotTask):
                 *self._height_rows("state", self.cfg.noise.scales.height_scan),
             ],
             "privileged_state": [
-                "state",  # the same noisy sample
+                "state",  # with the same noise sample
                 *self._body_rows(),
                 Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
                 Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar", unit="m/s", frame="world"),
@@ -249,11 +249,11 @@ class LeggedRobot(RobotTask):
         }
 
     def _gait_rows(self) -> list[Row]:
-        """With a gait clock the sines of the feet's phases, then the cosines; zeros when commanded to stand."""
+        """With a gait clock: sines of the feet's phases, then cosines; zeros with a command to stand."""
         return [Row("gait_clock", self.gait.row, mirror="foot")] if self.gait else []
 
     def _more_foot_rows(self) -> list[Row]:
-        """Rows that ``observations`` switches on: feet's heights above the ground; ground's forces, in 100 N."""
+        """Optional rows of ``observations``: heights of the feet above the ground; ground forces in 100 N."""
         rows = []
         if self.cfg.observations.foot_height:
             frame = "site above the ground under it"
@@ -265,7 +265,7 @@ class LeggedRobot(RobotTask):
         return rows
 
     def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
-        """The height scan [m] if ``terrain.height_scan`` names the group: by x from behind, each from right to left."""
+        """The height scan [m] if ``terrain.height_scan`` names the group; by x from behind, each from right to left."""
         row = Row("height_scan", self.height_scan, noise, mirror="height_scan", measured=group == "state")
         return [row] if group in self.cfg.terrain.height_scan else []
 
@@ -306,7 +306,7 @@ class LeggedRobot(RobotTask):
     # ---- statistics, checkpoint -------------------------------------------------------------------------------------
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Share of the commanded speed; mean terrain levels, of all worlds and by kind; the curriculum's share."""
+        """Share of the commanded speed; mean terrain levels of all worlds and by kind; the curriculum's share."""
         live = {**super()._live_statistics(), "walked": self._walked()}
         if self.tiles:
             live |= self.tiles.statistics()
@@ -316,15 +316,15 @@ class LeggedRobot(RobotTask):
         return live
 
     def _walked(self) -> Tensor:
-        """(2,) Present speed along the commanded direction, summed over worlds, and the commanded speed [m/s].
+        """(2,) The speed along the commanded direction, and the commanded speed [m/s], each summed over worlds.
 
-        Their quotient is the share of the commanded distance that the robots walk.
+        Their quotient is the walked share of the commanded distance.
         """
-        wanted, measured = self.commands[:, :2], self.base_lin_vel[:, :2]
-        speed = wanted.square().sum(dim=1).sqrt()
-        along = (measured * wanted).sum(dim=1) / speed.clamp(min=1e-6)
-        asked = speed > self.cfg.rewards.min_command
-        return torch.stack([torch.where(asked, each, 0.0).sum() for each in (along, speed)])
+        commanded, measured = self.commands[:, :2], self.base_lin_vel[:, :2]
+        speed = commanded.square().sum(dim=1).sqrt()
+        along = (measured * commanded).sum(dim=1) / speed.clamp(min=1e-6)
+        moving = speed > self.cfg.rewards.min_command
+        return torch.stack([torch.where(moving, each, 0.0).sum() for each in (along, speed)])
 
     def training_state(self) -> dict[str, Tensor]:
         state = super().training_state()
@@ -335,12 +335,12 @@ class LeggedRobot(RobotTask):
         return state
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from ``training_state``; on terrain with new episodes."""
+        """Load ``training_state``. On terrain, new episodes start."""
         super().load_training_state(state)
         if "command_curriculum" in state and self.cfg.commands.curriculum:
             self.command_curriculum.copy_(state["command_curriculum"])
             if int(state["num_envs"]) != self.num_envs:
-                self.command_curriculum[1:] = 0.0  # these counts were of other worlds
+                self.command_curriculum[1:] = 0.0  # these counts are of other worlds
             self._set_command_ranges()
         if "terrain_levels" in state and self.tiles:
             self._episode.zero_()  # unfinished episodes do not count
@@ -376,7 +376,7 @@ class LeggedRobot(RobotTask):
             raise error.renamed({"sites": "asset.foot_names or foot_geoms"}) from None
 
     def _sensed_geoms(self) -> list[str]:
-        """Feet first."""
+        """The geoms of the feet, then the others."""
         return [*(geom for geoms in self._sensed_sites().values() for geom in geoms), *super()._sensed_geoms()]
 
     def _sensed_sites(self) -> dict[str, list[str]]:
@@ -403,8 +403,8 @@ class LeggedRobot(RobotTask):
 
     def _episode_columns(self) -> dict[str, int]:
         times = ["feet_contact_time", "last_air_time", "last_contact_time"]
-        wanted = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
-        of_feet = [name for term in self._active_scales() for name in wanted.get(term, [])]
+        optional = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
+        of_feet = [name for term in self._active_scales() for name in optional.get(term, [])]
         of_feet += ["feet_air_time", "swing_peak"]
         ground = ["progress", "commanded_distance", "commanded_speed", "max_distance"] if self.terrain else []
         feet, walk = dict.fromkeys(of_feet, len(self.foot_names)), dict.fromkeys(ground, 1)
@@ -422,7 +422,7 @@ class LeggedRobot(RobotTask):
     last_foot_vel_z: Tensor  # (N, F) of the step before [m/s]; only with `feet_impact_vel`
 
     def _init_terrain(self) -> None:
-        """Tiles and heights, if there is terrain, and the points of the height scan, (P,) x and y [m]."""
+        """Make tiles and heights, if there is terrain, and the points of the height scan, (P,) x and y [m]."""
         cfg, terrain = self.cfg.terrain, self.terrain
         self.tiles = self.remember(Tiles(self.cfg, terrain, self.num_envs, self.device)) if terrain else None
         self._height_at = make_height_map(terrain, self.device) if terrain else None
@@ -438,15 +438,15 @@ class LeggedRobot(RobotTask):
         self.command_table, count = table, len(table)
         self.commands, self.command_timer = self.buffer(count), self.buffer(1)  # [unit of each]; [control steps]
         self.velocity_command = self.commands[:, :3]  # view: vx, vy [m/s], yaw rate [rad/s]
-        self.heading = self.buffer()  # wanted heading of the root's x axis in the world [rad]
+        self.heading = self.buffer()  # target heading of the root's x axis, world frame [rad]
         ranges = self._tensor([[command.low, command.high] for command in table])
         self.full_command_ranges = ranges.T.contiguous()  # (2, C)
-        self.command_ranges = self.remember(self.full_command_ranges.clone())  # those that commands come from
+        self.command_ranges = self.remember(self.full_command_ranges.clone())  # the ranges in use
         self._narrowest = self._tensor([command.default for command in table]).expand(2, count)
         rest = [0.0 if command.name in VELOCITY else command.default for command in table]
         self.rest_command = self._tensor(rest)
         self.keep_probability = self._tensor([*cfg.keep_probability, *[1.0] * (count - len(cfg.keep_probability))])
-        # share of the ranges; sum and number of the episodes since it last grew
+        # share of the ranges; sum and number of the episodes since its last increase
         curriculum = self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
         self.command_curriculum = self.remember(curriculum)
         if cfg.curriculum:
@@ -455,7 +455,7 @@ class LeggedRobot(RobotTask):
     # ---- reward terms, and what the active ones need besides the state ----------------------------------------------
 
     def on_training_progress(self, share: float) -> None:
-        """Move ``tracking_sigma`` towards ``rewards.tracking_sigma_end``; a ``share`` (0 to 1) of training is done."""
+        """Move ``tracking_sigma`` to ``rewards.tracking_sigma_end``. ``share``: progress of the training, 0 to 1."""
         super().on_training_progress(share)
         begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
         if isinstance(self._sigma, Tensor):
@@ -463,7 +463,7 @@ class LeggedRobot(RobotTask):
 
     @property
     def tracking_sigma(self) -> Tensor | float:
-        """Of the tracking terms [m^2/s^2, rad^2/s^2]: a number, () if it changes, (N,) if it grows with the level."""
+        """Sigma of the tracking terms [m^2/s^2, rad^2/s^2]: a number, () if it changes, (N,) if levels change it."""
         if self.sigma_growth is None or not self.tiles:
             return self._sigma
         return self._sigma * (1.0 + self.sigma_growth * self.tiles.levels)
@@ -473,17 +473,17 @@ class LeggedRobot(RobotTask):
         self._sigma = sigma
 
     def _init_foot_rewards(self) -> None:
-        """Allocate what the active terms need besides the state."""
+        """Make the buffers that only active terms need."""
         on, rewards = self._active_scales(), self.cfg.rewards
         self.tracking_sigma = rewards.tracking_sigma
         if rewards.tracking_sigma_end > 0.0:
             self.tracking_sigma = self.remember(torch.tensor(rewards.tracking_sigma, device=self.device))
-        # (N,) its growth a level, by each world's kind of ground
+        # (N,) increase per level, by each world's kind of ground
         self.sigma_growth = self.tiles.of_kinds(rewards.tracking_sigma_growth) if self.tiles else None
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return
         stands = upright(self.robot, self.default_dof_pos.tolist(), self.foot_names)
-        # (N, F, 3) the vertical in each foot's frame, in the default pose
+        # (N, F, 3) vertical axis in each foot's frame, in the default pose
         self.foot_up = self._tensor(stands.up).expand(self.num_envs, -1, -1)
         self.foot_bodies = torch.tensor(stands.bodies, dtype=torch.long, device=self.device)  # (F,) each foot's body
         if "feet_distance" in on and self.num_feet > 1:
@@ -504,7 +504,7 @@ class LeggedRobot(RobotTask):
         return self.feet.forces
 
     def _time_contacts(self) -> None:
-        """Time stances and swings if an active term reads them, after ``feet_air_time`` has counted this step."""
+        """Time stances and swings if an active term needs them, after ``feet_air_time`` was updated in this step."""
         own = vars(self)
         if "last_air_time" in own:
             lifted = ~self.foot_contact & (self.feet_contact_time > 0.0)
@@ -619,9 +619,9 @@ class LeggedRobot(RobotTask):
     def _reward_feet_phase(self) -> Tensor:
         """1 where feet have the clock's heights: ``rewards.swing_height`` in mid swing, 0 in stance. [P, H 5]"""
         swing = self._clock("feet_phase").swing()
-        rise = 1.0 - (2.0 * swing - 1.0).abs()  # up to 1 in mid swing, and back
-        wanted = self.cfg.rewards.swing_height * rise.square() * (3.0 - 2.0 * rise)  # a cubic, level at both ends [P]
-        return torch.exp((self.foot_height - wanted).square().sum(dim=1) / -PHASE_SIGMA)
+        rise = 1.0 - (2.0 * swing - 1.0).abs()  # rises to 1 at mid swing, then falls
+        target = self.cfg.rewards.swing_height * rise.square() * (3.0 - 2.0 * rise)  # a cubic, level at both ends [P]
+        return torch.exp((self.foot_height - target).square().sum(dim=1) / -PHASE_SIGMA)
 
     def _reward_contact_phase(self) -> Tensor:
         """Share of the feet that stand or swing by the clock. [U 0.18]"""

@@ -1,4 +1,4 @@
-"""The fields that walking by command adds to RobotTask's, typed, with unit and source.
+"""The fields of walking by command, in addition to RobotTask's, with type, unit and source.
 
 Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
 """
@@ -44,61 +44,61 @@ Marks = Annotated[list[Positive], or_empty(THREE)]
 
 
 class LeggedRobotCfg(RobotTaskCfg):
-    """Walking by command. Defaults are the joystick task [P]; the robot's own names and numbers are in configs/."""
+    """Walking by command. Defaults are the joystick task's [P]. A robot's names and numbers are in configs/."""
 
     class asset(RobotTaskCfg.asset):
-        foot_names: list[str] = []  # of sites, and of geoms without foot_geoms; in the order of observations
-        foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns; else the geom of its name
+        foot_names: list[str] = []  # names of sites, and of geoms without foot_geoms, in the order of observations
+        foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns; else the geom with its name
 
     class observations(RobotTaskCfg.observations):
-        foot_height: bool = False  # a row of `privileged_state`: each foot's height above the ground under it [m]
-        contact_forces: bool = False  # a row of `privileged_state`: ground's force on each foot, world [N] [ours: off]
+        foot_height: bool = False  # add a row to `privileged_state`: height of each foot above the ground under it [m]
+        contact_forces: bool = False  # add a row to `privileged_state`: each foot's ground force, world [N] [ours: off]
 
     class commands:
-        resampling_time: Duration = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
-        change_probability: Share = 0.5  # that a command changes at all when the timer ends [P]
-        # for each command: that a changed one is not its default; 1 for those beyond the list [P]
+        resampling_time: Duration = 5.0  # mean of an exponential timer in each world [s]; 0: never [P]
+        change_probability: Share = 0.5  # probability that a command changes when the timer ends [P]
+        # probability, per command, that a changed one is not its default; 1 beyond the list [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]
-        end_probability: Share = 0.0  # that a new value is one of the ends of its range [go2_rl_gym 0.2]
+        end_probability: Share = 0.0  # probability that a new value is an end of its range [go2_rl_gym 0.2]
 
-        curriculum: bool = False  # start with a share of the ranges, widen it while velocity is tracked well [L]
-        curriculum_start: PositiveShare = 0.4  # that share [-] [ours]
+        curriculum: bool = False  # start with a share of the ranges, increase it while velocity is tracked well [L]
+        curriculum_start: PositiveShare = 0.4  # the share at the start [-] [ours]
         # growth, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
         curriculum_step: PositiveShare = 0.1
 
-        heading_command: bool = False  # the yaw rate steers to a heading that is drawn in its place [L]
-        heading_gain: Positive = 0.5  # yaw rate a heading error, within its range [1/s] [L]
-        units: dict[str, str] = {}  # of commands of your own, by name
-        mirror: dict[str, Sign] = {}  # of commands of your own: 1.0, or -1.0 where left and right change the sign
-        default: dict[str, float] = {}  # of commands of your own: value at rest; else the nearest to 0 in the range
+        heading_command: bool = False  # the yaw rate steers to a heading, which is drawn instead [L]
+        heading_gain: Positive = 0.5  # yaw rate per heading error, within its range [1/s] [L]
+        units: dict[str, str] = {}  # of your own commands, by name
+        mirror: dict[str, Sign] = {}  # of your own commands: 1.0, or -1.0 if mirroring changes the sign
+        default: dict[str, float] = {}  # of your own commands: value at rest; else the nearest to 0
 
         class ranges:
-            """Lowest and highest of each command, in the policy's order. A task may declare its own after these."""
+            """Lowest and highest value of each command, in the policy's order. A task may add its own after these."""
 
             lin_vel_x: Range = [-1.5, 1.5]  # [m/s] [P]
             lin_vel_y: Range = [-0.8, 0.8]  # [m/s] [P]
             ang_vel_yaw: Range = [-1.2, 1.2]  # [rad/s] [P]
-            heading: Range = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
+            heading: Range = [-3.14, 3.14]  # [rad], world; only for heading_command, not observed by the policy [L]
 
     class gait:
-        """A clock of each foot's step (legged_mw/envs/feet.py), for the policy, feet_phase and contact_phase."""
+        """A clock for the steps of each foot (legged_mw/envs/feet.py), for the policy, feet_phase and contact_phase."""
 
-        period: Duration = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
-        offsets: list[Share] = []  # each foot's phase at clock 0, share of the period; empty: of two feet [0.0, 0.5]
-        stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
-        random_start: bool = True  # begin anywhere in the period: each leg learns to lead; False: at 0, as deploy
+        period: Duration = 0.0  # duration of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
+        offsets: list[Share] = []  # phase of each foot at clock 0, share of the period; empty: [0.0, 0.5] for two feet
+        stance: Stance = 0.55  # share of the period in which a foot stands, from its phase 0 [unitree_rl_gym]
+        random_start: bool = True  # start at a random phase: each leg learns to lead; False: at 0, as deploy
 
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
-        tracking_sigma_end: NonNegative = 0.0  # its value at max_iterations, reached linearly; 0: it stays [ours]
-        # kind of ground -> share of tracking_sigma that each level adds [go2_rl_gym: with the speed, too]
+        tracking_sigma_end: NonNegative = 0.0  # its value at max_iterations, reached linearly; 0: constant [ours]
+        # kind of ground -> share of tracking_sigma added per level [go2_rl_gym: with the speed, too]
         tracking_sigma_growth: dict[str, NonNegative] = {}
         swing_height: Swing = 0.1  # target height of a swinging foot [m] [P]
-        min_air_time: NonNegative = 0.1  # a shorter step is penalised [s] [P]
-        min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
-        min_feet_distance: Height = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
-        max_contact_force: NonNegative = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
-        max_single_stance: Positive = 0.4  # on one foot, for which `single_stance` pays most [s] [Isaac Lab: G1]
+        min_air_time: NonNegative = 0.1  # shorter steps are penalised [s] [P]
+        min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command is to stand [P]
+        min_feet_distance: Height = 0.2  # of `feet_distance`: sideways between left and right feet [m] [P: T1, G1]
+        max_contact_force: NonNegative = 100.0  # of `feet_contact_forces`: larger forces on a foot count [N] [L]
+        max_single_stance: Positive = 0.4  # of `single_stance`: time on one foot that pays most [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):
             """All [P]."""
@@ -128,44 +128,44 @@ class LeggedRobotCfg(RobotTaskCfg):
     class terrain(RobotTaskCfg.terrain):
         mesh_type: Literal["plane", "heightfield"] = "plane"  # heightfield: a grid of tiles, with the fields below
         num_rows: Count = 10  # levels of difficulty, along x [L]
-        num_cols: Count = 20  # tiles side by side along y, each column of one kind [L]
+        num_cols: Count = 20  # number of tiles along y; each column has one kind [L]
         tile_size: Positive = 8.0  # edge of a tile [m] [L]
-        horizontal_scale: CellSize = 0.05  # between two heights [m] [ours: L 0.1 makes a stair a slope of 50 degrees]
-        border_size: Border = 5.0  # flat ground around all tiles; past its middle an episode times out [m] [L 25]
-        difficulty: Difficulties = [0.0, 1.0]  # of the first and the last row: 0 easy, 1 hard, 2 at most [L]
+        horizontal_scale: CellSize = 0.05  # distance of heights [m] [ours: L 0.1 makes a stair a slope of 50 degrees]
+        border_size: Border = 5.0  # flat ground around the tiles; beyond its middle an episode times out [m] [L 25]
+        difficulty: Difficulties = [0.0, 1.0]  # of the first row and of the last: 0 easy, 1 hard, 2 at most [L]
         # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
         terrain_proportions: dict[str, NonNegative] = {
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
             **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.1},
         }
-        seed: NonNegativeInt = 1  # of all that is random in it
-        curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
+        seed: NonNegativeInt = 1  # seed of the terrain
+        curriculum: bool = True  # change levels by success; False: a random level at each reset [L]
         max_init_terrain_level: NonNegativeInt = 5  # highest level at the start of training, or the last one [L]
         measured_points_x: Points = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
-        measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
-        height_scan: list[Literal["state", "privileged_state"]] = []  # groups of observations that get the row
+        measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # of the height scan, to the left [m] [L]
+        height_scan: list[Literal["state", "privileged_state"]] = []  # observation groups with this row
 
     class exam:
         """The walking exam of --eval and of training (docs/grading.md); all [ours]."""
 
         ranges: dict[str, Range] = {}  # lin_vel_x, lin_vel_y, ang_vel_yaw -> low, high; others: commands.ranges
         push_speeds: list[Positive] = []  # jumps of velocity [m/s]; empty: 0.5 1 1.5 2 3, and 4 5 6 if not on two feet
-        push_vx: float = 0.0  # vx of a robot that is pushed [m/s]; 0: half of the highest
-        transport_vx: float = 0.0  # vx of the cost of transport [m/s]; 0: half of the highest
+        push_vx: float = 0.0  # vx during pushes [m/s]; 0: half of the highest
+        transport_vx: float = 0.0  # vx for the cost of transport [m/s]; 0: half of the highest
         # highest errors or offsets of a walk: vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest vx,
         # 0.06, 0.1 of the highest yaw rate, or offsets 0.06, 0.06, 0.12
         marks: Marks = []
-        # offset: of the mean velocity; empty: offset on two feet, which sway, else error
+        # offset: error of the mean velocity; empty: offset on two feet, which sway, else error
         marks_of: Literal["", "error", "offset"] = ""
         push_mark: NonNegative = 0.0  # a walk survives all pushes of this speed [m/s]; 0: 1 on two feet, else 2
-        peer: str = ""  # go1, go2, g1: compare with its published policies of resources/peers.yaml; empty: none
+        peer: str = ""  # go1, go2, g1: compare with its published policies in resources/peers.yaml; empty: none
 
     def check(self) -> None:
         super().check()
         feet, commands = self.asset.foot_names, self.commands
         if not feet or "*" in "".join(feet) or len({*feet}) < len(feet):
-            wanted = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
-            raise ConfigError(f"asset.foot_names is {feet!r}; it must be {wanted}")
+            expected = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
+            raise ConfigError(f"asset.foot_names is {feet!r}; it must be {expected}")
         for name, span in vars(commands.ranges).items():  # a task may have declared its own
             fit(span, Range, f"commands.ranges.{name}")
         names = [name for name in vars(commands.ranges) if name != HEADING]

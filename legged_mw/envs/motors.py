@@ -182,9 +182,9 @@ class Actuators:
             torques: Any = self._compute(sent)
             if not isinstance(torques, Tensor) or torques.shape != sent.shape:
                 name = getattr(self._compute, "__qualname__", "_compute_torques")
-                found = (*torques.shape,) if isinstance(torques, Tensor) else f"{torques!r:.40}"
+                shape = (*torques.shape,) if isinstance(torques, Tensor) else f"{torques!r:.40}"
                 what = f"must return a tensor {tuple(sent.shape)}, a torque a joint"
-                raise ConfigError(f"{name} {what}; it returned {found}")
+                raise ConfigError(f"{name} {what}; it returned {shape}")
             sent = torques
         self._sim.ctrl.copy_(sent)
 

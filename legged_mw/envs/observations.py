@@ -61,9 +61,9 @@ def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
             raise StepError(f"{what}; write Row(name, value, ...), or the name of a group", where)
         value = row.value
         if not isinstance(value, Tensor) or value.dim() != 2 or len(value) != count or not value.numel():
-            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-            wanted = f"a tensor ({count}, size), a row a world"
-            raise StepError(f"row '{row.name}' of '{group}' is {got}; it must be {wanted}", where)
+            actual = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            expected = f"a tensor ({count}, size), a row a world"
+            raise StepError(f"row '{row.name}' of '{group}' is {actual}; it must be {expected}", where)
     return table
 
 

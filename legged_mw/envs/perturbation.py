@@ -1,4 +1,4 @@
-"""Kicks and pushes: a kick is a force over time, a push is a velocity set at once."""
+"""Kicks and pushes: a kick is a force over time, a push changes the velocity at once."""
 
 from __future__ import annotations
 

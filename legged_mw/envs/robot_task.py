@@ -618,12 +618,12 @@ class RobotTask(BaseTask):
         """Indices of the joints that match ``wanted`` (patterns or parts of names), without held joints."""
         names, held = self.robot.joint_names, self.robot.held
         fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
-        for word, found in fits.items():
-            if not found:
+        for word, joints in fits.items():
+            if not joints:
                 raise ConfigError(f"rewards.{field}: {unknown('joint', word, names, 'the robot')}")
-            if {*found} <= {*held}:
-                self.robot.overrides.append(f"rewards.{field}: '{word}' left out, as {', '.join(found)} are held")
-        indices = [i for i, name in enumerate(names) if any(name in found for found in fits.values())]
+            if {*joints} <= {*held}:
+                self.robot.overrides.append(f"rewards.{field}: '{word}' left out, as {', '.join(joints)} are held")
+        indices = [i for i, name in enumerate(names) if any(name in joints for joints in fits.values())]
         return torch.tensor(indices, dtype=torch.long, device=self.device)
 
     def _reward_alive(self) -> Tensor:
@@ -704,7 +704,7 @@ class RobotTask(BaseTask):
         return (self.dof_vel.abs() - self.soft_speed).clamp(0.0, 1.0).sum(dim=1)
 
     def _reward_fast_joints(self) -> Tensor:
-        """Squared joint speeds beyond a turn a second [rad^2/s^2]. [P]"""
+        """Squared joint speeds beyond one turn per second [rad^2/s^2]. [P]"""
         return (self.dof_vel.abs() - 2.0 * torch.pi).clamp(min=0.0).square().sum(dim=1)
 
     def _reward_torque_limits(self) -> Tensor:
@@ -815,9 +815,9 @@ def check_term(method: Callable[[], Any], count: int) -> Tensor:
     """The value of a reward method. Raises StepError, with the method's file and line, unless its shape is (count,)."""
     value = method()
     if not isinstance(value, Tensor) or value.shape != (count,):
-        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        wanted = f"must return a tensor ({count},), one value an environment"
-        raise StepError(f"{wanted}; it returned {got}", place_of(method))
+        actual = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        expected = f"must return a tensor ({count},), one value an environment"
+        raise StepError(f"{expected}; it returned {actual}", place_of(method))
     return value
 
 

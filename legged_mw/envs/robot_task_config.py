@@ -1,4 +1,4 @@
-"""Every field of RobotTask, typed, with unit and source. Tasks override these in configs/.
+"""All fields of RobotTask, with type, unit and source. Tasks override them in configs/.
 
 Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
 "A table a joint" maps keys to values. A joint has that of its exact name, else of the longest key in it, or of "".
@@ -264,8 +264,8 @@ class RobotTaskCfg(Config):
             what = "an origin of angles, but under control.actuator 'torque' an action is a torque"
             raise ConfigError(f"control.action_origin is {origin!r}, {what}: leave action_origin out")
         for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
-            wanted = law == "dc_motor" or (law != "servo" and curve)
-            if wanted and not getattr(control, name):
+            needed = law == "dc_motor" or (law != "servo" and curve)
+            if needed and not getattr(control, name):
                 what = f"control.actuator is {law!r} with a torque-speed curve, but control.{name} is empty"
                 raise ConfigError(f"{what}: fill the table [{unit}] a joint, '' for all (docs/motors.md)")
             if self.domain_rand.enable and getattr(self.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:

@@ -1,1 +1,1 @@
-"""Grade policies: the walking exam, on rough ground too, the skill exams and the report."""
+"""Grade policies: the walking exam, its rough part, the skill exams and the report."""

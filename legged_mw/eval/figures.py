@@ -59,18 +59,18 @@ def step_response(time: Array, measured: Array, start: float, target: float) -> 
     Both are None if ``measured`` does not begin near ``start`` or does not settle near ``target``.
     ``left``: mean difference to the target in the last half second, in the unit of ``measured``.
     """
-    way = (measured - start) / (target - start)
-    after = (time >= 0.0) & np.isfinite(way)
-    time, way = time[after], way[after]
+    progress = (measured - start) / (target - start)
+    after = (time >= 0.0) & np.isfinite(progress)
+    time, progress = time[after], progress[after]
     if not len(time):
         return {"rise_time": None, "overshoot": None, "left": None}
-    end = way[time >= time[-1] - 0.5]
+    end = progress[time >= time[-1] - 0.5]
     left = float(np.mean(end - 1.0)) * (target - start)
-    if abs(way[0]) > STRAY or abs(np.mean(end) - 1.0) > STRAY:
+    if abs(progress[0]) > STRAY or abs(np.mean(end) - 1.0) > STRAY:
         return {"rise_time": None, "overshoot": None, "left": left}
-    low, high = _first_crossing(time, way, 0.1), _first_crossing(time, way, 0.9)
+    low, high = _first_crossing(time, progress, 0.1), _first_crossing(time, progress, 0.9)
     rise_time = None if low is None or high is None else high - low
-    return {"rise_time": rise_time, "overshoot": max(0.0, float(way.max()) - 1.0), "left": left}
+    return {"rise_time": rise_time, "overshoot": max(0.0, float(progress.max()) - 1.0), "left": left}
 
 
 def _first_crossing(time: Array, values: Array, level: float) -> float | None:

@@ -322,7 +322,7 @@ def misses(result: Mapping[str, Any]) -> list[str]:
     survived = conditions[ALL]["pushes"]
     texts += [f"survives {survived:.0%} of the pushes under all, not {PUSHES:.0%}"] if survived < PUSHES else []
     if not walk:
-        return [*texts, "falls while it is looked at"]
+        return [*texts, "falls in the gait measurement"]
     for name in ("angle", "target"):
         share, joint = walk[f"{name}_at_limit"]["worst"], walk[f"{name}_at_limit"]["joint"]
         texts += [f"{name} of {joint} at its limit {share:.0%} of the time"] if share > LIMITS else []

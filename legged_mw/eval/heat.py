@@ -94,14 +94,14 @@ def finish(
     """
     result: dict[str, Any] = {
         "joints": list(joints),
-        "ratings": {name: found for name in TABLES if any(map(bool, found := _plain(getattr(ratings, name))))},
+        "ratings": {name: texts for name in TABLES if any(map(bool, texts := _plain(getattr(ratings, name))))},
         BATTERY: None if math.isnan(ratings.battery_power) else ratings.battery_power,
         "unknown": unknown(ratings),
         "phases": {name: phase(each, ratings, limit) if each else None for name, each in motions.items()},
         "switch": switched(switch, ratings, joints) if switch else None,
         "switches": switches,
     }
-    return {**result, "reasons": (found := reasons(result)), "trips": True if found else _verdict(result)}
+    return {**result, "reasons": (texts := reasons(result)), "trips": True if texts else _verdict(result)}
 
 
 def unknown(ratings: Ratings) -> list[str]:

@@ -198,9 +198,7 @@ class ExamRules:
             f"{name} {low:g} to {high:g} {unit}" for (name, unit), (low, high) in zip(AXES, self.ranges, strict=True)
         ]
         common = (
-            ", the one range that all published policies of this robot were asked"
-            if COMMON.get(self.peer) == self.ranges
-            else ""
+            ", the common range of all published policies of this robot" if COMMON.get(self.peer) == self.ranges else ""
         )
         return f"asked: {', '.join(spans)}{common}"
 
@@ -212,12 +210,12 @@ class ExamRules:
         if len(self.peers) == 1:
             return f"The peer is {first.name}'s policy for this robot, graded by the same rules in MuJoCo's C engine."
         note = (
-            f"* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at {self.push_vx:g} m/s: "
+            f"* Their pushes and cost of transport were measured at half of each policy's highest vx, not at {self.push_vx:g} m/s: "
             "compare them with care."
         )
         return (
-            f"Best of {len(self.peers)}: figure by figure the best of any published policy for this robot that was asked these ranges, "
-            f"each in its own scene, in MuJoCo's C engine; no policy has them all. {note if first.own_speed else ''}"
+            f"Best of {len(self.peers)}: for each figure, the best value of the published policies for this robot with these ranges, "
+            f"each measured in its own scene in MuJoCo's C engine; no policy has all best values. {note if first.own_speed else ''}"
         ).strip()
 
     def commands(self) -> list[Velocity]:
@@ -302,11 +300,11 @@ class ExamRules:
             able[f"follow {axis} ({error:.2f} {unit} off; {limit:.2g} are allowed)"] = error <= limit
         can, cannot = ([text for text, value in able.items() if value is wanted] for wanted in (True, False))
         if not cannot:
-            hint = "play.py --eval, the whole exam and the hard one"
+            hint = "play.py --eval runs the whole exam and the hard exam"
         elif falls:
-            hint = "train longer with --resume; if it goes on falling, --set perturbation.velocity for weaker kicks"
+            hint = "train longer with --resume; if it still falls, weaken the kicks with --set perturbation.velocity"
         else:
-            hint = "train longer with --resume; play.py --eval says at which commands it is off and which pushes it survives"
+            hint = "train longer with --resume; play.py --eval shows the error of each command and the survived pushes"
         return [
             f"it can: {'; '.join(can) or 'nothing yet'}",
             f"it cannot: {'; '.join(cannot) or '-'}",
@@ -326,7 +324,7 @@ class ExamRules:
         """The figures of the result in the table's order, including those that only ``others`` have."""
         peer, no_values = best_of(self.peers), (None, None, None)
         star = "*" if any(peer.own_speed for peer in self.peers) else ""
-        found = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
+        rows = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
         for i, (axis, unit) in enumerate(AXES):
             card = (f"{axis.removesuffix(' rate')} {self.marks_of}", unit)
             for measure, name in {
@@ -337,15 +335,15 @@ class ExamRules:
                 mark, on_card = (self.marks[i], card) if measure == self.marks_of else (None, None)
                 peer_value = peer.get(measure, no_values)[i]
                 if measure != "offset" or measure == self.marks_of or peer_value is not None:
-                    found.append(Figure(name, result[measure][i], 3, mark, peer_value, card=on_card))
+                    rows.append(Figure(name, result[measure][i], 3, mark, peer_value, card=on_card))
         if any("estimate_rms" in each for each in (result, *others)):
             rms = result.get("estimate_rms") or (None, None)
-            found += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
-        found.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
-        found.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
+            rows += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
+        rows.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
+        rows.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
         for speed, share in result["pushes"].items():
             mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
-            found.append(
+            rows.append(
                 Figure(
                     f"survives pushes of {speed} m/s",
                     share,
@@ -360,7 +358,7 @@ class ExamRules:
         name, speed_text = "cost_of_transport", f"at {self.transport_vx:g} m/s"
         card = ("cost of transport", speed_text)
         return [
-            *found,
+            *rows,
             Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=star),
         ]
 
@@ -448,7 +446,7 @@ def in_common(peer: str) -> dict[str, Any]:
     """
     if (robot := robot_of(peer)) not in COMMON:
         raise ConfigError(
-            f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}"
+            f"--ranges common: exam.peer is '{robot}'; a common range of all published policies is known for: {', '.join(COMMON)}"
         )
     ranges = {name: list(ends) for name, ends in zip(VELOCITY, COMMON[robot], strict=True)}
     return {"ranges": ranges, "push_vx": 0.0, "transport_vx": 0.0}

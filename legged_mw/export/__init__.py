@@ -1,1 +1,1 @@
-"""Exports a run as network, contract and scene, which are compared with the training first. rl imports none of it."""
+"""Export a run as network, contract and scene, after a comparison with the training. rl imports nothing from it."""

@@ -1,4 +1,4 @@
-"""Contract and scenes of an export, made from the environment of its training."""
+"""Make the contract and the scenes of an export from the training environment."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ from legged_mw.utils.task import LoadedTask
 
 
 def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
-    """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
+    """Make the contract of the network in ``folder``, trained with the noise level ``noise``. Writes the scene, too."""
     cfg, robot = task.cfg, env.robot
     scene = _write_scene(env, folder)
     ends = _ends(env)
@@ -104,7 +104,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
 def _exam(task: LoadedTask) -> dict[str, Any] | None:
     """The exam of an export: the section ``exam``, and its kind if that is not the walking exam."""
     section = task.cfg.to_dict().get("exam", {})
-    if task.exam == "walking":  # a task's own fields are no part of it
+    if task.exam == "walking":  # without the task's own fields
         return {name: section[name] for name in LeggedRobotCfg().to_dict()["exam"] if name in section}
     return {"kind": task.exam, **section} if task.exam else None
 
@@ -124,11 +124,11 @@ def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
 
 
 def _write_scene(env: RobotTask, folder: Path) -> Scene:
-    """The robot at its start, as MJCF."""
+    """Write the robot in its start pose as MJCF."""
     cfg, robot, law = env.cfg, env.robot, env.actuators.law
     if law == OWN_LAW:
         raise ExportError(
-            f"{type(env).__name__}._compute_torques is a motor law in code, which no export can state; "
+            f"{type(env).__name__}._compute_torques is a motor law in code, which an export cannot contain; "
             "train the policy that is to be exported with a law of control.actuator (docs/motors.md)"
         )
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
@@ -142,7 +142,7 @@ def _write_scene(env: RobotTask, folder: Path) -> Scene:
 
 
 def _motors(env: RobotTask, folder: Path) -> Motors:
-    """The law of the motors; a network is copied to ``folder``."""
+    """The law of the motors. A network's file is copied to ``folder``."""
     curve = (tuple(env.robot.tables.get(name, ())) for name in CURVE)
     if env.actuators.law == "network":
         shutil.copyfile(find_file(env.cfg, "control.network"), folder / MOTORS_FILE)
@@ -152,7 +152,7 @@ def _motors(env: RobotTask, folder: Path) -> Motors:
 
 
 def _motion(env: RobotTask, folder: Path) -> FollowedMotion | None:
-    """The motion that the policy follows; its frames are written to ``folder``."""
+    """The reference motion of the policy. Its frames are written to ``folder``."""
     if not isinstance(env, MotionTracking):
         return None
     save_clip(folder / MOTION_FILE, env.clips[0])
@@ -160,7 +160,7 @@ def _motion(env: RobotTask, folder: Path) -> FollowedMotion | None:
 
 
 def _ends(env: RobotTask) -> Ends:
-    """The task's rule for a fall."""
+    """The task's rules for a fall."""
     rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.terminating_contacts.tolist()]
     tilt = rule.max_tilt if rule.max_tilt < 180.0 else None
     return Ends(tilt, rule.min_base_height or None, tuple(geoms), own_ends(type(env)))
@@ -173,7 +173,7 @@ def _gait(env: RobotTask) -> Gait:
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
-    """A group's rows, with how they are measured if that is known. A row that is a group gives its rows."""
+    """A group's rows, with their sensors if known. A row that is a group is replaced by its rows."""
     rows = []
     for row in env.observations.groups[group]:
         if row.group:
@@ -184,7 +184,7 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
                 )
             rows += contract_rows(env, row.group, noise)
             continue
-        # a clock of the task's own
+        # the task's own clock
         known = ROWS.get(row.name) if row.name != CLOCK or getattr(env, "gait", None) else None
         units = ", ".join(command.unit for command in env.command_table) if row.name == "commands" else ""
         rows.append(
@@ -204,7 +204,7 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
 
 
 def write_terrain(env: RobotTask, task: LoadedTask, folder: Path) -> str:
-    """Write the scene with steps and blocks of the trained kinds, at three levels; returns why there is none, or ''."""
+    """Write the scene with steps and blocks of the trained kinds, at three levels. Returns why there is none, or ''."""
     ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind in LEVEL - {"flat"}]
     if not kinds:

@@ -1,6 +1,6 @@
-"""Exports a trained policy as network, contract and scene, after a comparison with the environment of its training.
+"""Export a trained policy as network, contract and scene, after a comparison with the training environment.
 
-``legged_mw.deploy.contract`` says what the files mean. Nothing here is needed to run them.
+``legged_mw.deploy.contract`` defines the files. Running an export does not need this module.
 """
 
 from __future__ import annotations
@@ -47,27 +47,27 @@ from legged_mw.utils.errors import shown
 from legged_mw.utils.files import STAGED, digest, finish_moving
 from legged_mw.utils.task import LoadedTask
 
-FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
+FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last, because it names the other files
 SOMETIMES = (TERRAIN_FILE, MOTORS_FILE, MOTION_FILE)
 ONCE = ("terrain.xml",)  # files of older exports
-WORLDS = 8  # of the rollout for the comparison
-NETWORK_TOLERANCE = 1e-4  # of actions, relative above 1: float32 sums in another order
+WORLDS = 8  # number of worlds in the comparison
+NETWORK_TOLERANCE = 1e-4  # of actions, relative if above 1; float32 sums depend on their order
 
 
 class Exported(NamedTuple):
     """The result of an export."""
 
     files: tuple[str, ...]
-    gap: float  # largest difference of an action to the trained policy's
-    observations: int  # in the comparison
-    # observation rows that nothing says how to measure: the export cannot be deployed
+    gap: float  # largest difference between exported and trained actions
+    observations: int  # number of compared observations
+    # observation rows without known sensors; such an export cannot be deployed
     unknown: tuple[str, ...]
-    no_terrain: str = ""  # why there is no scene with the steps of training, or ''
-    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes, and do not end a walk
+    no_terrain: str = ""  # why there is no scene with steps, or ''
+    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training and do not end a walk
     half: bool = False  # the weights are rounded to float16
 
     def text(self, folder: Path) -> str:
-        """A line on the files, and a line for each obstacle to their use."""
+        """One line about the files, and one line for each reason why they cannot be used."""
         rounded = ", its weights rounded to half precision" if self.half else ""
         lines = [f"written to {shown(folder)}: {', '.join(self.files)}{rounded}"]
         lines[0] += f"; actions differ from the trained policy's by {self.gap:.0e} at most"
@@ -88,15 +88,15 @@ class Exported(NamedTuple):
 
 
 def export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> Exported:
-    """Write the policy in ``checkpoint``, of the task as it was ``trained``, to ``folder``: all files, or none.
+    """Write the policy in ``checkpoint`` to ``folder``: all files, or none. ``trained``: the task with that config.
 
-    ``half``: round the weights to float16 and store them so; the rounded policy is compared. Raises ExportError,
-    ContractError, ConfigError or ModelError; then an earlier export in the folder stays.
+    ``half``: round the weights to float16 and store them so. The comparison uses these weights. Raises ExportError,
+    ContractError, ConfigError or ModelError. Then an earlier export in the folder is not changed.
     """
     precision = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")  # training may have set a lower one, which some CPUs follow
+    torch.set_float32_matmul_precision("highest")  # training may have set a lower precision, which some CPUs use
     try:
-        with torch.random.fork_rng(devices=[]):  # the rollout must not change the caller's random numbers
+        with torch.random.fork_rng(devices=[]):  # the rollout must not change the caller's random state
             torch.default_generator.manual_seed(0)
             return _export(trained, checkpoint, folder, half)
     finally:
@@ -139,20 +139,20 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
             gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         if all(row.measured for row in contract.rows):
-            read_contract(new)  # raises if a reader would
+            read_contract(new)  # raises for an export that cannot be read
         files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
     return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered, half)
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
-    """The task as trained, with kicks and pushes, but small, on a CPU, without slopes, noise and delays."""
+    """A small environment of the trained task on a CPU, with kicks and pushes, without slopes, noise and delays."""
     settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
     settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay", "slope")}
     if hasattr(task.cfg, "motion"):
-        settings["motion.clips"] = task.cfg.motion.clips[:1]  # the clip that a deployed robot follows
+        settings["motion.clips"] = task.cfg.motion.clips[:1]  # a deployed robot follows only this clip
     if hasattr(task.cfg.terrain, "mesh_type"):
-        settings["terrain.mesh_type"] = "plane"  # the scene holds the robot alone
+        settings["terrain.mesh_type"] = "plane"  # the scene contains only the robot
     for path, value in settings.items():
         task.set(path, value, where="export")
     return task.env_class(task.cfg, "cpu", eager=True)
@@ -161,7 +161,7 @@ def _small_env(task: LoadedTask) -> RobotTask:
 def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> None:
     try:
         save_onnx(policy, clip, path)
-    except Exception as error:  # torch's exporter raises many kinds
+    except Exception as error:  # torch's exporter raises many types
         first = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
     if half:
@@ -169,14 +169,14 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
 
 
 def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.ndarray]:
-    """The right outputs of an exported network: actions, and memory or estimate if there is one."""
+    """The expected outputs of an exported network: actions, and memory or estimate if there is one."""
     with torch.inference_mode():
         outputs = ExportedPolicy(policy, clip)(*(torch.from_numpy(values) for values in inputs if values is not None))
     return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
 
 
 def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
-    """The largest difference, relative above 1."""
+    """The largest difference, relative if above 1."""
     return (
         float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max())
         if got.shape == wanted.shape
@@ -185,11 +185,11 @@ def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
 
 
 def _check_network(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
-    """The largest difference. Raises ExportError if the network acts or estimates otherwise than the policy."""
+    """Return the largest difference. Raises ExportError if the network's output differs from the policy's."""
     gap = _gap(got, wanted)
-    if not gap <= NETWORK_TOLERANCE:  # NaN too
+    if not gap <= NETWORK_TOLERANCE:  # also for NaN
         raise ExportError(
-            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on "
+            f"{NETWORK_FILE} {does} differently from the trained policy: up to {gap:g} apart on "
             f"{len(wanted)} recorded observations (at most {NETWORK_TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
@@ -200,19 +200,19 @@ def _check_network(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> f
 
 @contextmanager
 def _all_or_nothing(folder: Path) -> Iterator[Path]:
-    """A temporary folder. One rename makes its files the export; a later program finishes a killed move."""
+    """Yield a temporary folder. One rename publishes its files; a later program completes an interrupted move."""
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder} is a file; name a folder to export to")
     new, mine = folder / f".export.{os.getpid()}.tmp", [part for part in (folder, *folder.parents) if not part.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(new, ignore_errors=True)  # of an earlier process with the same number
+        shutil.rmtree(new, ignore_errors=True)  # left by an earlier process with the same number
         new.mkdir()
-        finish_moving(folder)  # of an export that was killed before
+        finish_moving(folder)  # of an interrupted export
         sweep(folder)
         yield new
         for name in (*FILES, *SOMETIMES, *ONCE):
-            (new / name).touch()  # an empty file deletes that of an earlier export
+            (new / name).touch()  # an empty file deletes that file of an earlier export
             _flush(new / name)
         _flush(new)
         os.replace(new, folder / STAGED)
@@ -222,12 +222,12 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(new, ignore_errors=True)
         with suppress(OSError):
-            for part in mine:  # empty folders, if nothing was written
+            for part in mine:  # folders are empty if nothing was written
                 part.rmdir()
 
 
 def _flush(path: Path) -> None:
-    """Have a file, or a folder's list of files, on the disk itself, where a power cut does not reach it."""
+    """Write a file, or a folder's entries, from the cache to the disk, to survive a power cut."""
     opened = os.open(path, os.O_RDONLY)
     try:
         os.fsync(opened)

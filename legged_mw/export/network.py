@@ -1,4 +1,4 @@
-"""A policy's network as an ONNX file: written, stored at half precision, run."""
+"""Write a policy's network as an ONNX file, store it at half precision, and run it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ INPUT, OUTPUT = "obs", "actions"
 
 
 class ExportedPolicy(nn.Module):
-    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside.
+    """Observations (N, size) in their units -> clipped mean actions (N, A). It contains the normaliser.
 
-    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of
-    one that estimates, the estimate (N, E) comes out beside them.
+    A recurrent policy also has its state (N, states, H) as input and output. A policy with an estimator also has the
+    estimate (N, E) as output.
     """
 
     policy: Any
@@ -45,7 +45,7 @@ class ExportedPolicy(nn.Module):
 def run_onnx(
     path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None
 ) -> np.ndarray:
-    """Actions (B, A), or another output, of an ONNX file, by onnxruntime, or onnx's evaluator without it."""
+    """Actions (B, A), or another output, of an ONNX file, computed by onnxruntime, else by onnx's evaluator."""
     inputs = {INPUT: observations} | ({} if memory is None else {MEMORY_INPUT: memory})
     try:
         import onnxruntime
@@ -60,10 +60,10 @@ def run_onnx(
 
 
 def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file, with ``obs`` (batch, size) as input and ``actions`` (batch, A) as output."""
+    """Write one ONNX file without external data. Input ``obs`` (batch, size), output ``actions`` (batch, A)."""
     exported = ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's exporter warns of its internals, and of missing torchvision
+        warnings.simplefilter("ignore")  # torch's exporter warns about its own code and missing torchvision
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             exported,
@@ -81,7 +81,7 @@ def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
 
 
 def _strip(path: Path) -> None:
-    """Drop the exporter's notes for debugging: stack traces, with folders of this machine."""
+    """Remove the exporter's debug data: stack traces with folders of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -93,7 +93,7 @@ def _strip(path: Path) -> None:
     for value in (*graph.input, *graph.output, *graph.value_info):
         for dim in value.type.tensor_type.shape.dim:
             if dim.dim_param:
-                dim.dim_param = "batch"  # the one free dimension, of any name
+                dim.dim_param = "batch"  # the only free dimension
     onnx.save(model, path)
 
 
@@ -101,7 +101,7 @@ def _strip(path: Path) -> None:
 
 
 def _weights(policy: MLPModel) -> dict[str, nn.Parameter]:
-    """The parameters stored at half precision. Biases and the normaliser stay float32: few, and rounding costs more."""
+    """The parameters to store at half precision. Biases and the normaliser stay float32: their rounding costs more."""
     return {name: parameter for name, parameter in policy.named_parameters() if parameter.dim() > 1}
 
 
@@ -112,7 +112,7 @@ def round_weights(policy: MLPModel) -> None:
 
 
 def halve(policy: MLPModel, path: Path) -> None:
-    """Store the weights of the rounded ``policy`` in ``path`` as float16, each with a Cast back to float32."""
+    """Store the rounded weights of ``policy`` in ``path`` as float16, each with a Cast to float32."""
     import onnx
     from onnx import numpy_helper
 

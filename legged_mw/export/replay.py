@@ -1,4 +1,4 @@
-"""Compares ``legged_mw.deploy`` with the environment: recorded steps are played through deploy's own controller."""
+"""Compare ``legged_mw.deploy`` with the environment: run recorded steps through deploy's controller."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.errors import UserError
 
 STEPS = 32
-CONTRACT_TOLERANCE = 1e-4  # relative above 1: MJCF has six digits, and the environment computes in float32
+CONTRACT_TOLERANCE = 1e-4  # relative if above 1; MJCF has six digits, and the environment computes in float32
 
 
 class ExportError(UserError, RuntimeError):
@@ -35,22 +35,22 @@ class ExportError(UserError, RuntimeError):
 class Step(NamedTuple):
     """One control step of N worlds in the environment."""
 
-    observation: np.ndarray  # (N, size) of the actor
+    observation: np.ndarray  # (N, size) of the actor's group
     measured: Measurement
     commands: np.ndarray  # (N, C)
-    actions: np.ndarray  # (N, D) of the policy, not clipped
-    taken: np.ndarray  # (N, D) actions of the environment
-    targets: np.ndarray  # (N, D) of the motors [rad], by encoders with an offset; or torques [N m]
-    ended: np.ndarray  # (N,) the episode ended, and the reset replaced the targets
-    clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 where there is none
-    frame: np.ndarray  # (N,) of the motion; 0 where there is none
+    actions: np.ndarray  # (N, D) from the policy, before clipping
+    taken: np.ndarray  # (N, D) applied actions
+    targets: np.ndarray  # (N, D) motor targets [rad], including encoder offsets; or torques [N m]
+    ended: np.ndarray  # (N,) true if the episode ended: the reset replaced the targets
+    clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 without a clock
+    frame: np.ndarray  # (N,) frame of the motion; 0 without a motion
     memory: np.ndarray  # (N, states, H) the policy's state before it acted; (N, 0, 0) without a memory
 
 
 def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Contract, folder: Path) -> list[Step]:
-    """Record the policy in ``env``, with the measurements of a robot that runs the export in ``folder``.
+    """Record the policy in ``env``. The measurements are those of a robot that runs the export in ``folder``.
 
-    The last two worlds get large random actions on top, so that some actions are clipped and some robots fall.
+    In the last two worlds large random actions are added, so that some actions are clipped and some robots fall.
     """
     fleet, steps = Fleet(folder, contract, env.num_envs, threads=1), []
     seen = env.get_observations()
@@ -77,10 +77,10 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
 
 
 def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
-    """The present measurements of the environment's robots.
+    """The current measurements of the environment's robots.
 
-    Deploy's own scene measures positions and velocities, in the state of the environment. What needs forces or contacts
-    comes from the environment, whose sensors are one physics step old and zero after a reset.
+    Deploy's scene measures positions and velocities in the environment's state. Forces and contacts are from the
+    environment, whose sensors are one physics step old and zero after a reset.
     """
     fleet.qpos[:], fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
     fleet.refresh()
@@ -106,7 +106,7 @@ def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
 
 
 def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) -> None:
-    """Play ``steps`` through deploy's controller. Raises ExportError for a different observation, memory or target."""
+    """Run ``steps`` through deploy's controller. Raises ExportError if an observation, memory or target differs."""
     recorded = iter(steps)
 
     def network(_: Any, memory: np.ndarray | None = None) -> Any:
@@ -118,9 +118,9 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
     controller = Controller(folder, contract, env.num_envs, network)
     for number, step in enumerate(steps):
         if controller.clock:
-            controller.clock.start[:] = step.clock  # an episode of training may begin anywhere in the period
+            controller.clock.start[:] = step.clock  # in training an episode may start at any phase
         if controller.follower:
-            controller.follower.start = step.frame  # anywhere in the motion
+            controller.follower.start = step.frame  # and at any frame
         observed, start = controller.observe(step.measured, step.commands), 0
         for row in contract.rows:
             columns = slice(start, start := start + row.size * row.history)
@@ -147,13 +147,13 @@ def _check_equal(
     env: RobotTask, step: int, what: str, names: Sequence[Any], theirs: np.ndarray, ours: np.ndarray
 ) -> None:
     """Raise ExportError for the first value (world, column) that differs."""
-    wrong = np.argwhere(~(np.abs(ours - theirs) <= CONTRACT_TOLERANCE * np.maximum(1.0, np.abs(theirs))))  # NaN too
+    wrong = np.argwhere(~(np.abs(ours - theirs) <= CONTRACT_TOLERANCE * np.maximum(1.0, np.abs(theirs))))  # or NaN
     if not len(wrong):
         return
     world, column = wrong[0]
     own = ", ".join(overridden(type(env))) or "no method"
     raise ExportError(
-        f"legged_mw.deploy would act otherwise than the environment: {what} {names[column]} is "
+        f"legged_mw.deploy would act differently from the environment: {what} {names[column]} is "
         f"{theirs[world, column]:.6g} in the environment and {ours[world, column]:.6g} by {CONTRACT_FILE}, "
         f"at step {step}. {type(env).__name__} overrides {own}. State it where the contract can take it from: "
         "an action's scale and origin in section control, a row's scale in its Row, a value of your own as a row of "
@@ -162,7 +162,7 @@ def _check_equal(
 
 
 def own_ends(task: type[RobotTask]) -> tuple[str, ...]:
-    """Methods of the task's own classes that may end an episode, which a contract cannot state."""
+    """Methods of the task's classes that may end an episode. A contract cannot express them."""
     own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
     return tuple(
         f"{kind.__name__}.{name}"
@@ -173,7 +173,7 @@ def own_ends(task: type[RobotTask]) -> tuple[str, ...]:
 
 
 def overridden(task: type[RobotTask]) -> list[str]:
-    """Methods of RobotTask or LeggedRobot that the task overrides, without rewards."""
+    """Methods of RobotTask or LeggedRobot that the task overrides, except rewards."""
     own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
     names = [
         name for kind in own for name, value in vars(kind).items() if callable(value) and hasattr(LeggedRobot, name)

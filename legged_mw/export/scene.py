@@ -1,7 +1,7 @@
-"""A robot with ground, servos and named sensors as one MJCF text that needs no other file.
+"""Write a robot with ground, servos and named sensors as one MJCF text that needs no other file.
 
-Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is
-checked.
+It adds sensors and a keyframe, and writes meshes from files into the text. A check compares the physics with that of
+the trained model.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError
 
-AROUND = 1000.0  # width of the level ground around the steps [m]
-HOME = "home"  # keyframe with the start pose, and the servos holding it
-MODEL_TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
+AROUND = 1000.0  # [m] width of the level ground around the steps
+HOME = "home"  # keyframe with the start pose and its servo targets
+MODEL_TOLERANCE = 1e-5  # relative, absolute if below 1; MuJoCo writes MJCF with six digits
 _OPTION = (
     *("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance"),
     *("disableflags", "enableflags", "gravity", "impratio"),
@@ -55,7 +55,7 @@ class Scene:
     """A scene as text, and its sensors."""
 
     xml: str
-    sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
+    sensors: dict[str, list[str]]  # quantity -> sensors; their concatenated values are the quantity
 
 
 def standalone(
@@ -66,19 +66,19 @@ def standalone(
     camera: Sequence[float] = (),
     source: str = "",
 ) -> Scene:
-    """``robot`` as MJCF text, with sensors for a controller, and ``qpos``, ``ctrl`` as keyframe "home".
+    """Return ``robot`` as MJCF text, with sensors for a controller, and ``qpos`` and ``ctrl`` as keyframe "home".
 
-    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be
-    written out. Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
+    ``source``: the text of the robot's file. It shows which meshes MuJoCo builds; others must be written as vertices.
+    Raises ModelError if the text cannot be made, or if its physics differs from the trained model's.
     """
     spec = with_scene(robot, camera)
     if files := [field.name for field in spec.hfields if field.file]:
         raise ModelError(
-            f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers"
+            f"height field '{files[0]}' comes from a file; an export must need no other file, so build it from numbers"
         )
     what = "robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained."
     spec.comment = f"\n    {spec.modelname}: {what}\n  "
-    for geom in spec.geoms:  # group 0 is the ground's: a height scan's rays look for it there
+    for geom in spec.geoms:  # a height scan's rays hit group 0 only, which is the ground
         if geom.group == 0 and geom.parent.name != "world":
             geom.group = 1
     sensors = _add_sensors(spec, robot.joint_names, imu)
@@ -92,16 +92,16 @@ def standalone(
         raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
     if wrong := differences(robot.physics, model):
         raise ModelError(
-            f"the robot written as one MJCF would be another machine: {', '.join(wrong)} differ from the trained model"
+            f"the robot written as one MJCF has other physics: {', '.join(wrong)} differ from the trained model"
         )
     return Scene(xml, sensors)
 
 
 def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
-    """The scene of ``standalone`` on boxes, the level pieces of ``terrain``; the robot starts at ``start`` [m].
+    """The scene of ``standalone`` on boxes, the level pieces of ``terrain``. The robot starts at ``start`` [m].
 
-    Level ground surrounds them for ``AROUND``. Raises ModelError for slopes and noise, which are no level pieces, and
-    for too many pieces: as text, a height field would have some megabytes.
+    Level ground of width ``AROUND`` surrounds them. Raises ModelError for slopes and noise, which are not level, and
+    for too many pieces. A height field as text would have several megabytes.
     """
     spec = mujoco.MjSpec.from_string(xml)
     floor, (boxes, _, left) = spec.geom(GROUND), as_boxes(terrain)
@@ -123,7 +123,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     }
     for (low, high, top), tile in zip(pieces, tiles, strict=True):
         box = add_ground_box(spec, np.array([*low, bottom]), np.array([*high, top]))
-        tone = (1.0, 0.7)[tops[tile].index(top) % 2]  # a step has another tone than the next one
+        tone = (1.0, 0.7)[tops[tile].index(top) % 2]  # neighbouring steps have different tones
         box.material, box.rgba = floor.material, [tone, tone, tone, 1.0]
         box.classname = _class_of(spec, "light_step" if tone == 1.0 else "dark_step", box)
     floor.pos = [0.0, 0.0, bottom]
@@ -137,17 +137,17 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
 
 
 def _class_of(spec: mujoco.MjSpec, name: str, box: mujoco.MjsGeom) -> mujoco.MjsDefault:
-    """The defaults called ``name``, made from its first box without place and size. They halve the file."""
-    found = spec.find_default(name)
-    if not found:
-        found = spec.add_default(name, spec.default)
+    """The default class ``name``, made from its first box without place and size. Defaults halve the file's size."""
+    default = spec.find_default(name)
+    if not default:
+        default = spec.add_default(name, spec.default)
         for field in ("type", "conaffinity", "priority", "friction", "material", "rgba"):
-            setattr(found.geom, field, getattr(box, field))
-    return found
+            setattr(default.geom, field, getattr(box, field))
+    return default
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:
-    """Quantity -> sensors; adds those that training computes from the state. Contacts keep training's sensors."""
+    """Quantity -> sensors. Adds sensors of values that training computes from the state; keeps contact sensors."""
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     taken = {sensor.name for sensor in spec.sensors}
 
@@ -158,7 +158,7 @@ def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[s
         return full
 
     site, joint = objects.mjOBJ_SITE, objects.mjOBJ_JOINT
-    # the world's z axis seen from the IMU: gravity points the other way
+    # the world's z axis in the IMU's frame; gravity has the opposite direction
     up = {"objtype": objects.mjOBJ_BODY, "objname": "world", "reftype": site, "refname": imu}
     return {
         "lin_vel": [add("velocimeter", imu, kinds.mjSENS_VELOCIMETER, site)],
@@ -172,7 +172,7 @@ def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[s
 
 
 def _write_out_files(spec: mujoco.MjSpec) -> None:
-    """Turn meshes from files into numbers in the text, and drop pictures, which are only looks."""
+    """Replace meshes from files by vertices in the text, and remove textures, which do not affect physics."""
     pictures = {t.name for t in spec.textures if t.file or any(t.cubefiles)}
     for material in spec.materials:
         material.textures = ["" if name in pictures else name for name in material.textures]
@@ -186,7 +186,7 @@ def _write_out_files(spec: mujoco.MjSpec) -> None:
                 slice(start[0], start[0] + count[0])
                 for start, count in ((view.vertadr, view.vertnum), (view.faceadr, view.facenum))
             )
-            mujoco.mju_quat2Mat(rotation, model.mesh_quat[view.id])  # compiled, a mesh lies in its principal axes
+            mujoco.mju_quat2Mat(rotation, model.mesh_quat[view.id])  # a compiled mesh is in its principal axes
             places = model.mesh_vert[vertices] @ rotation.reshape(3, 3).T + model.mesh_pos[view.id]
             mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
             mesh.uservert, mesh.userface = places.ravel(), model.mesh_face[faces].ravel()
@@ -194,7 +194,7 @@ def _write_out_files(spec: mujoco.MjSpec) -> None:
 
 
 def differences(trained: mujoco.MjModel, model: mujoco.MjModel) -> list[str]:
-    """Names of the physical fields that differ; visual geoms, sensors and keyframes do not count."""
+    """Names of the physical fields that differ. Visual geoms, sensors and keyframes are not compared."""
     wrong = [f"option {name}" for name in _OPTION if not _close(getattr(trained.opt, name), getattr(model.opt, name))]
     wrong += [name for name in _FIELDS if not _close(getattr(trained, name), getattr(model, name))]
     colliding = [np.flatnonzero(m.geom_contype | m.geom_conaffinity) for m in (trained, model)]
@@ -212,15 +212,15 @@ def _close(a: object, b: object) -> bool:
 
 # ---- meshes that MuJoCo builds from some numbers, written as those numbers: as text, their vertices are most of an MJ
 
-_BUILT = ("vertex", "normal", "texcoord", "face", "facenormal", "facetexcoord")  # follow from the few numbers
+_BUILT = ("vertex", "normal", "texcoord", "face", "facenormal", "facetexcoord")  # computed from the parameters
 _PLACES = ("mesh_vertnum", "mesh_facenum", "mesh_vert", "mesh_pos", "mesh_quat", "geom_pos", "geom_quat", "geom_size")
-PLACE_TOLERANCE = 1e-5  # of places [m] and of quaternions: MuJoCo writes six digits
+PLACE_TOLERANCE = 1e-5  # of positions [m] and quaternions; MuJoCo writes six digits
 
 
 def shorten(xml: str, source: str) -> str:
-    """``xml``, written by MuJoCo, with the few numbers of ``source`` for meshes that MuJoCo builds.
+    """Replace meshes that MuJoCo builds by their parameters from ``source``. ``xml``: as MuJoCo wrote it.
 
-    As it was, where that would be another model: a mesh may have been renamed, or come from a file that ``source``
+    Returns ``xml`` unchanged if the result is another model: a mesh may be renamed, or come from a file that ``source``
     includes.
     """
     short = xml
@@ -234,16 +234,18 @@ def shorten(xml: str, source: str) -> str:
 
 
 def built_meshes(source: str) -> dict[str, str]:
-    """Mesh -> the attributes from which MuJoCo builds it, in the MJCF ``source``; none if that is no MJCF."""
+    """Mesh -> the attributes from which MuJoCo builds it, in the MJCF ``source``; empty if it is not an MJCF."""
     try:
         meshes = [
             mesh for mesh in ElementTree.fromstring(source).iter("mesh") if mesh.get("name") and mesh.get("builtin")
         ]
     except ElementTree.ParseError:
         return {}
-    wanted = ("builtin", "params")
+    attributes = ("builtin", "params")
     return {
-        mesh.attrib["name"]: " ".join(f"{key}={quoteattr(mesh.attrib[key])}" for key in wanted if key in mesh.attrib)
+        mesh.attrib["name"]: " ".join(
+            f"{key}={quoteattr(mesh.attrib[key])}" for key in attributes if key in mesh.attrib
+        )
         for mesh in meshes
     }
 

@@ -1,1 +1,1 @@
-"""Speed only: the step compiler, skipped physics kernels, kernels of the update. All works without this folder."""
+"""Faster training: the step compiler, skipped physics kernels, kernels of the update. All works without them."""

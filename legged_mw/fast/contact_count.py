@@ -1,4 +1,4 @@
-"""Count the contacts of sensed geoms in one kernel, instead of mujoco-warp's search, sort and readout."""
+"""Count the contacts of sensed geoms with one kernel, instead of mujoco-warp's search, sort and output."""
 
 # pyright: reportGeneralTypeIssues=false, reportCallIssue=false, reportAssignmentType=false
 # pyright: reportArgumentType=false, reportIndexIssue=false, reportAttributeAccessIssue=false
@@ -15,12 +15,12 @@ from mujoco_warp._src.types import ContactType
 
 wp.set_module_options({"enable_backward": False})
 
-_CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))  # a contact that pushes; others only feed sensors
+_CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))  # a contact with a force; others are for sensors only
 _FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
 
 
 def countable(model: mujoco.MjModel) -> dict[int, tuple[int, int, int]]:
-    """Sensors that only count the contacts of one geom with another: those geoms, and the column of ``sensordata``."""
+    """Sensors that only count the contacts of two geoms -> the geoms, and the column in ``sensordata``."""
     sensors, geom = {}, int(mujoco.mjtObj.mjOBJ_GEOM)
     for i in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT):
         between_geoms = model.sensor_objtype[i] == geom and model.sensor_reftype[i] == geom
@@ -38,11 +38,11 @@ def count_contacts(model: mujoco.MjModel, put: mjw.Model) -> Callable[[mjw.Data]
     sensors = countable(model)
     left = [int(i) for i in put.sensor_contact_pos_adr.numpy() if int(i) not in sensors]
     put.sensor_contact_pos_adr = wp.array(left, dtype=int)
-    wanted = wp.array([*sensors.values()], dtype=wp.vec3i)
+    table = wp.array([*sensors.values()], dtype=wp.vec3i)
 
     def count(d: mjw.Data) -> None:
         contact = d.contact
-        inputs = [wanted, contact.geom, contact.worldid, contact.type, d.nacon]
+        inputs = [table, contact.geom, contact.worldid, contact.type, d.nacon]
         wp.launch(_count, dim=(contact.geom.shape[0], len(sensors)), inputs=inputs, outputs=[d.sensordata])
 
     return count

@@ -1,8 +1,8 @@
-"""Fuse the many small operations of a step into a few warp kernels, in which a thread computes one world.
+"""Fuse the many small operations of a step into a few warp kernels. One thread computes one world.
 
-One real call of the step is traced. Operations within a world go into kernels. Others (random numbers, sums over
-worlds) stay torch's, and the simulator's calls keep their places. Before a fused step is used, each part of it is
-compared with the operations that it replaces, on the data of a real step.
+The operations of one real step are traced. Operations within a world are fused into kernels. Other operations, such as
+random numbers and sums over worlds, still run in torch. The simulator's calls keep their order. Before a fused step is
+used, the result of each part is compared with that of the original operations, on the data of a real step.
 """
 
 # pyright: reportInvalidTypeForm=false
@@ -27,15 +27,15 @@ from legged_mw.fast.trace import Call, Node, Trace, alike
 if wp.config.log_level < wp.LOG_WARNING:  # MuJoCo's engine steps: keep warp from announcing its devices and modules
     wp.config.log_level = wp.LOG_ERROR
 
-BLOCK, LANES = 32, 8  # threads a block, threads a world: 4096 worlds fill a large GPU
-_WIDE, _RESIDENT = 64, 2**18  # an operation on more values takes 32 lanes, where a large GPU holds them all at once
+BLOCK, LANES = 32, 8  # threads per block, threads per world: 4096 worlds fill a large GPU
+_WIDE, _RESIDENT = 64, 2**18  # with more values an operation gets 32 lanes, if a large GPU can run all at once
 _ROOM = 5_500  # bytes of shared memory for the temporaries of one world
 _CLOSE = 1e-4  # relative and absolute tolerance: float32 rounding over a few operations
-_STRAYS = 0.002  # share of elements that may differ more, where rounding flipped a comparison
+_STRAYS = 0.002  # share of elements with a larger difference, such as after a comparison with rounding
 
 
 class Kernel:
-    """A kernel over several nodes: one thread a world on a CPU, several threads (lanes) a world on a GPU."""
+    """A kernel of several nodes: one thread per world on a CPU, several threads (lanes) per world on a GPU."""
 
     def __init__(self, nodes: Sequence[Node], worlds: int) -> None:
         self.nodes, self._worlds = nodes, worlds
@@ -67,16 +67,16 @@ class Kernel:
         self._kernel = _kernel_of(wp.func_native(self._source)(_body))
 
     def _lanes_of_gpu(self) -> int:
-        """Threads a world: 8 for many short operations in a row, 32 for wide ones."""
+        """Threads per world: 8 for many short operations, 32 for wide operations."""
         widest = max(math.prod(view.shape[1:]) for node in self.nodes for view in node.writes)
         return BLOCK if widest > _WIDE and self._worlds * BLOCK <= _RESIDENT else LANES
 
     def _size(self, tensor: Tensor) -> int:
-        """Elements of one world's part of a tensor, or of a whole tensor that all worlds share."""
+        """Number of elements of one world's part of a tensor, or of a tensor that all worlds share."""
         return tensor.numel() // (self._worlds if tensor.shape[:1] == (self._worlds,) else 1)
 
     def compile(self) -> None:
-        """Compile into warp's kernel cache, without loading. On a CPU loading compiles."""
+        """Compile into warp's cache without loading. On a CPU ``load`` compiles."""
         if self._device != "cpu":
             wp.compile_aot_module(self._kernel.module, device=self._device)
 
@@ -102,7 +102,7 @@ def _kernel_of(body: Any) -> Any:
 
 
 class Region:
-    """The operations between two calls of the simulator, original and fused."""
+    """The operations between two calls of the simulator, in original and fused form."""
 
     def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace, device: str, there: set[int]) -> None:
         """``there``: blocks of memory that exist before the step."""
@@ -120,7 +120,7 @@ class Region:
             step() if isinstance(step, Kernel) else _replay(step)
 
     def verify(self, device: str) -> bool:
-        """Run original and fused kernels from the same state. Returns whether they agree; if not, keep the original."""
+        """Run original and fused kernels from the same state. Returns whether they agree; else keeps the original."""
         before, random = [value.clone() for value in self._written], _generator(device).get_state()
         for node in self.nodes:
             _replay(node)
@@ -138,7 +138,7 @@ class Region:
 
 
 class Fused:
-    """A step, fused from its trace: ``compile`` it (in any thread), ``verify`` it on a real step, then call it."""
+    """A fused step, made from its trace: ``compile`` it (in any thread), ``verify`` it on a real step, then call it."""
 
     def __init__(self, trace: Trace, worlds: int, device: str) -> None:
         self._device, self.parts = device, list[Region | Call]()
@@ -181,7 +181,7 @@ class Fused:
         return [kernel for part in self.parts if isinstance(part, Region) for kernel in part.kernels]
 
     def compile(self) -> None:
-        """Compile the kernels that are not in warp's cache. Safe beside a graph capture on the same GPU."""
+        """Compile the kernels that are not in warp's cache. It may run during a graph capture on the same GPU."""
         for kernel in self.kernels:
             kernel.compile()
         self.compiled = True
@@ -210,7 +210,7 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> 
     """Sort the operations topologically and group them into as few kernels as possible."""
     codes = [_code(node, worlds, trace, device) for node in nodes]
     waits, wakes = _dependencies(nodes)
-    ready: tuple[list[int], list[int]] = ([], [])  # nodes of torch, nodes that fit a kernel
+    ready: tuple[list[int], list[int]] = ([], [])  # nodes for torch, nodes for a kernel
 
     def wake(i: int) -> None:
         heapq.heappush(ready[codes[i] is not None], i)
@@ -239,7 +239,7 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> 
                 done(i)
             elif together:
                 later.append(i)
-            else:  # not even alone
+            else:  # it does not fit, even alone
                 yield nodes[i]
                 done(i)
         ready[1].extend(sorted(later))
@@ -248,9 +248,9 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> 
 
 
 def _join(nodes: Sequence[Node], watched: set[int]) -> list[Node]:
-    """Join pairs of operations that can be written as one, if nobody else reads what the first gives.
+    """Join pairs of operations that have one common code, if no other node reads the intermediate result.
 
-    Blocks that are ``watched`` stay torch's to write.
+    Only torch may write blocks in ``watched``.
     """
     readers = Counter(view.block for node in nodes for view in node.reads)
     joined = list[Node]()
@@ -298,7 +298,7 @@ def _code(node: Node, worlds: int, trace: Trace, device: str) -> Code | None:
     for view in (*node.reads, *node.writes):
         if str(trace.blocks[view.block].device) != device or trace.blocks[view.block].dtype != view.dtype:
             return None
-    with suppress(Unfit, TypeError, ValueError, IndexError):  # arguments in an unknown form
+    with suppress(Unfit, TypeError, ValueError, IndexError):  # arguments of an unknown form
         return Writer(worlds, trace.view, lambda block: (f"p{block}", False)).emit(node)
     return None
 
@@ -329,7 +329,7 @@ def _dependencies(nodes: Sequence[Node]) -> tuple[list[int], list[set[int]]]:
 
 
 class _Rows:
-    """The memory accesses of a kernel. In a block that one node writes, all nodes must stay in their world's row."""
+    """The memory accesses of a kernel. In a block that one node writes, all nodes must access their world's row."""
 
     def __init__(self, worlds: int) -> None:
         self._worlds = worlds
@@ -363,7 +363,7 @@ class _Rows:
         return True
 
     def _row(self, access: Access) -> int:
-        """Pitch of the row that the access stays in; 0: a value that all worlds share; -1: it leaves its row."""
+        """Pitch of the row of the access; 0: a value that all worlds share; -1: it accesses other rows."""
         if access.pitch == 0:
             return 0
         low = access.low % (self._worlds * access.pitch)
@@ -401,7 +401,7 @@ _INTO: dict[str, Callable[..., Any]] = {
 
 
 def _whole(tensor: Tensor) -> Tensor:
-    """All of a tensor's memory as one row."""
+    """The whole memory of a tensor as one row."""
     storage = tensor.untyped_storage()
     return tensor.as_strided((storage.nbytes() // tensor.element_size(),), (1,), 0)
 

@@ -1,7 +1,7 @@
-"""Generate C for torch's operations, as one thread runs them for one world.
+"""Generate C code for torch's operations: one thread computes one world.
 
-An operation fits if a world's result depends only on its own values and on values that all worlds share. Other and
-unknown operations are left to torch: ``emit`` raises ``Unfit``.
+An operation fits if a world's result depends only on its own values and on values that all worlds share. Torch runs
+other and unknown operations: ``emit`` raises ``Unfit``.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from torch import Tensor
 from legged_mw.fast.fused_memory import TYPES, WORLD, Access, Code, Lines, Unfit, span_of, spread
 from legged_mw.fast.trace import Node
 
-SMALL = 64  # elements of a shared value up to which each thread computes it for itself
+SMALL = 64  # number of elements of a shared value up to which each thread computes it
 
 
 class _Joined:
-    """Stands for two operations of torch that are written as one."""
+    """Represents two operations of torch that are written as one."""
 
     tags = ()
     overloadpacket = None
@@ -34,7 +34,7 @@ class _AddRows(_Joined):
 
 
 class _Assign(_Joined):
-    """``to.copy_(torch.where(mask, value, to))``: of what ``mask`` leaves alone nothing is read or written."""
+    """``to.copy_(torch.where(mask, value, to))``. Elements without ``mask`` are neither read nor written."""
 
     def __call__(self, to: Tensor, mask: Tensor, value: Tensor) -> Tensor:
         return to.copy_(torch.where(mask, value, to))
@@ -55,7 +55,7 @@ _ONE = {  # name -> C of a unary operation on a
     "sinc": "({a} == 0.0f ? 1.0f : sinf(3.14159265358979f * {a}) / (3.14159265358979f * {a}))",
     "isnan": "{a} != {a}", "isfinite": "FINITE({a})", "square": "{a} * {a}",
 }  # fmt: skip
-_TWO = {  # of a binary operation on a and b
+_TWO = {  # name -> C of a binary operation on a and b
     "add": "{a} + {b}", "sub": "{a} - {b}", "rsub": "{b} - {a}", "mul": "{a} * {b}", "div": "{a} / {b}",
     "atan2": "atan2f({a}, {b})", "hypot": "sqrtf({a} * {a} + {b} * {b})", "maximum": "MAXIMUM({a}, {b})",
     "minimum": "MINIMUM({a}, {b})", "clamp_min": "MAXIMUM({a}, {b})", "clamp_max": "MINIMUM({a}, {b})",
@@ -84,10 +84,10 @@ _REDUCTIONS = {  # name -> initial value, update of the accumulator s by a
 
 
 class Writer(Lines):
-    """Generates the lines of operations."""
+    """Generates C code of operations."""
 
     def emit(self, node: Node) -> Code:
-        """The lines of ``node``. Raises Unfit."""
+        """The code of ``node``. Raises Unfit."""
         if len(node.writes) != 1 or any(view.dtype not in TYPES for view in (*node.reads, *node.writes)):
             raise Unfit
         if node.func is ADD_ROWS:
@@ -110,7 +110,7 @@ class Writer(Lines):
         return Code(["{", *lines, "}", "SYNC"], self._reads, self._access(out, out.shape))
 
     def _add_rows(self, to: Tensor, rows: Tensor) -> Code:
-        """Sums over worlds of values that are mostly 0, such as counts: a thread adds only a value that is not 0."""
+        """Sum over worlds of values that are mostly 0, such as counts. A thread adds only nonzero values."""
         out, source = self._view(to), self._view(rows)
         if out.dtype != torch.float32 or rows.shape[0] != self._worlds or math.prod(rows.shape[1:]) != to.numel():
             raise Unfit
@@ -138,8 +138,8 @@ class Writer(Lines):
         if name in _COPIES or (name == "bitwise_not" and self._out.dtype == torch.bool):
             name, args = ("logical_not", args) if name == "bitwise_not" else (name, args[:1])
         text = _ONE.get(name) or _TWO.get(name) or _THREE.get(name)
-        wanted = 1 if name in _ONE else 2 if name in _TWO else 3
-        if text is None or len(args) < wanted:
+        count = 1 if name in _ONE else 2 if name in _TWO else 3
+        if text is None or len(args) < count:
             raise Unfit
         kinds = self._kinds(name, args)
         if name in _FLOATS and torch.float32 not in (kinds[0], self._out.dtype):
@@ -153,7 +153,7 @@ class Writer(Lines):
         return self._store(shape, index, value, [arg for arg in args if isinstance(arg, Tensor)])
 
     def _kinds(self, name: str, args: Sequence[Any]) -> list[torch.dtype]:
-        """The types that the operands are converted to."""
+        """The types to which the operands are converted."""
         if name in _COPIES:
             return [args[0].dtype]
         if name in _COMPARING:
@@ -189,7 +189,7 @@ class Writer(Lines):
         return self._store(shape, index, value, [v for v in (x, low, high) if isinstance(v, Tensor)])
 
     def _assign(self, to: Tensor, mask: Tensor, value: Any) -> list[str]:
-        """Write ``value`` into the elements of ``to`` where ``mask`` is true; the others are not touched."""
+        """Write ``value`` into the elements of ``to`` where ``mask`` is true."""
         view, shape, index = self._view(to), self._out.shape, self._index(self._out.shape)
         if view != self._out or mask.dtype != torch.bool:
             raise Unfit
@@ -198,7 +198,7 @@ class Writer(Lines):
             raise Unfit
         chosen, new = self._read(mask, shape, index), self._value(value, shape, index, view.dtype)
         store = f"{self._write(index)} = ({TYPES[view.dtype]})({new});"
-        if math.prod(mask.shape) == self._worlds:  # one value a world: the loop is left out
+        if math.prod(mask.shape) == self._worlds:  # one value per world needs no loop
             return [f"if ({chosen}) {{", *self._loops(shape, index, [store]), "}"]
         return self._loops(shape, index, [f"if ({chosen}) {store}"])
 
@@ -262,7 +262,7 @@ class Writer(Lines):
         return self._emit_constant_pad_nd(x, pad, value or 0)
 
     def _emit_flatten(self, x: Tensor, *_: Any) -> list[str]:
-        """The same elements in a new shape, if that needs a copy."""
+        """Copy the elements to a new shape, if that needs a copy."""
         view, strides = self._view(x), [math.prod(x.shape[d + 1 :]) for d in range(x.dim())]
         if self._shared or x.shape[0] != self._worlds or self._out.dtype != x.dtype:
             raise Unfit
@@ -301,7 +301,7 @@ class Writer(Lines):
         return self._loops([1 if d in dims else n for d, n in enumerate(x.shape)], kept, body)
 
     def _join(self, tensors: Sequence[Tensor], dim: int, stacked: bool) -> list[str]:
-        """cat and stack: each tensor goes to its place along ``dim``."""
+        """cat and stack: copy each tensor to its position along ``dim``."""
         shape, lines, start = self._out.shape, list[str](), 0
         dim %= len(shape)
         if dim == 0 and not self._shared:
@@ -329,7 +329,7 @@ class Writer(Lines):
         return self._join(tensors, dim, stacked=True)
 
     def _picked(self, x: Tensor, place: Sequence[str]) -> str:
-        """An element of ``x`` at indices computed at run time; in a tensor of worlds only the world's own row."""
+        """An element of ``x`` at indices of run time. In a tensor of worlds only the world's own row is allowed."""
         view = self._view(x)
         own = bool(place) and place[0] == WORLD and x.shape[0] == self._worlds
         access = self._access(view, view.shape) if own else Access(view, 0, view.offset, view.offset + span_of(view))

@@ -1,4 +1,4 @@
-"""C code for memory: elements of a view, loops over elements, and how the lanes of a world share them."""
+"""C code for memory: elements of a view, loops over elements, and the division of work among the lanes of a world."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ const int lane = thread % LANES, w = thread / LANES;
 
 
 class Unfit(Exception):
-    """The operation is left to torch."""
+    """Torch must run the operation."""
 
 
 class Access(NamedTuple):
-    """A world's part of a view: elements [low, high) of its row. Rows are ``pitch`` apart; 0: all worlds share one."""
+    """A world's part of a view: elements [low, high) of its row. ``pitch``: distance of rows; 0: one shared row."""
 
     view: View
     pitch: int
@@ -53,7 +53,7 @@ class Access(NamedTuple):
 
 
 class Code(NamedTuple):
-    """An operation's lines and its accesses: reads first, the write last."""
+    """The code of an operation and its accesses: first the reads, then the write."""
 
     lines: list[str]
     reads: list[Access]
@@ -61,11 +61,11 @@ class Code(NamedTuple):
 
 
 class Lines:
-    """Generates C for memory. ``place`` gives a block's name in C, and whether it is a temporary of one world."""
+    """Generates C code for memory. ``place`` gives a block's name in C, and whether it is a temporary of one world."""
 
     _out: View  # output of the current operation
     _reads: list[Access]  # its reads
-    _shared: bool  # it is one value for all worlds
+    _shared: bool  # the output is one value for all worlds
 
     def __init__(self, worlds: int, view: Callable[[Tensor], View], place: Callable[[int], tuple[str, bool]]) -> None:
         self._worlds, self._view, self._place = worlds, view, place
@@ -102,7 +102,7 @@ class Lines:
         return names if self._shared else [WORLD, *names[1:]]
 
     def _loops(self, shape: Sequence[int], index: Sequence[str], body: Iterable[str], alone: bool = False) -> list[str]:
-        """Loops of ``body`` over all elements; a world's lanes share the first loop, or one lane runs it ``alone``."""
+        """Loops of ``body`` over all elements. The lanes share the first loop; with ``alone`` one lane runs it."""
         loops = [(n, i) for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
         heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in loops]
         if not alone:
@@ -115,7 +115,7 @@ class Lines:
         return [" ".join(heads) + " {", *body, "}"]
 
     def _store(self, shape: Sequence[int], index: Sequence[str], value: str, reads: Iterable[Tensor] = ()) -> list[str]:
-        """Write ``value`` to every element; through a copy if it reads other elements of the same memory."""
+        """Write ``value`` to every element. Use a copy if it reads other elements of the same memory."""
         kind = TYPES[self._out.dtype]
         views = [self._view(tensor) for tensor in reads]
         if all(view.block != self._out.block or view[2:] == self._out[2:] for view in views):
@@ -133,7 +133,7 @@ class Lines:
 
 
 def spread(view: View, shape: Sequence[int]) -> list[int]:
-    """Strides of ``view`` broadcast to ``shape``: 0 where it is repeated."""
+    """Strides of ``view`` broadcast to ``shape``: 0 in repeated dimensions."""
     strides = [s if n != 1 else 0 for n, s in zip(view.shape, view.strides, strict=True)]
     return [0] * (len(shape) - len(strides)) + strides
 

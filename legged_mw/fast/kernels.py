@@ -1,6 +1,6 @@
-"""Warp kernels of the recorded update; each replaces about a dozen of torch's. On a CPU callers use torch's own.
+"""Warp kernels of the recorded update. Each replaces about a dozen of torch's kernels. A CPU uses torch's own.
 
-They run in torch's stream, so its graph captures them.
+They run in torch's stream, so torch's CUDA graphs record them.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false
@@ -18,10 +18,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-ROWS = 32  # summed by a thread
-_AT_ONCE = 8  # rows that it reads before it writes any, to wait for memory once
+ROWS = 32  # number of rows that one thread sums
+_AT_ONCE = 8  # number of rows read before a write, to wait for memory once
 _Rows = wp.types.matrix(shape=(_AT_ONCE, 4), dtype=float)
-_BLOCK = 128  # threads a block: few enough that small layers use every processor
+_BLOCK = 128  # threads per block: small layers then use every processor
 _HALF_LOG_2PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 
 
@@ -114,7 +114,7 @@ for _types in ((wp.vec4, wp.vec4, wp.vec4), (wp.int64, wp.int64, wp.int64), (wp.
 
 
 def _fours(x: Tensor) -> Tensor:
-    """(B, C) as C / 4 columns of four values: an integer of bfloat16 bits, or a float32 vector."""
+    """(B, C) as C / 4 columns of four values: an integer with the bits of four bfloat16, or a float32 vector."""
     return x.view(torch.int64) if x.dtype == torch.bfloat16 else x.unflatten(1, (-1, 4))
 
 
@@ -124,7 +124,7 @@ def fits(rows: int, sizes: list[int]) -> bool:
 
 
 def elu_backward(grad: Tensor, out: Tensor, sums: Tensor, first: int) -> Tensor:
-    """The gradient at an ELU's input, from that at its output and the output itself, all (B, C), in the output's type.
+    """The gradient at an ELU's input, from the gradient at its output and the output itself, all (B, C).
 
     Its sums over every ROWS rows go to the columns of ``sums`` (B / ROWS, ...) from ``first`` on. float32 or bfloat16.
     """
@@ -143,7 +143,7 @@ def policy_loss(
     actions: wp.array2d[float],
     advantages: wp.array2d[float],
     old_log_prob: wp.array2d[float],
-    old_mean: wp.array2d[float],  # of samples that are no mirror images, which come first; likewise the next
+    old_mean: wp.array2d[float],  # of samples without mirror images, which come first; also in the next lines
     old_std: wp.array2d[float],
     clip: float,
     of_mean: wp.array2d[float],
@@ -181,7 +181,7 @@ def policy_sums(
     std: wp.array[float],
     entropy_coef: wp.array[float],
     rows: float,
-    size: float,  # number of samples that are no mirror images
+    size: float,  # number of samples without mirror images
     of_std: wp.array[float],
     parts: wp.array[float],  # surrogate loss, entropy, KL divergence
 ):
@@ -200,7 +200,7 @@ def value_loss(
     values: wp.array2d[float],
     old: wp.array2d[float],
     returns: wp.array2d[float],
-    clip: float,  # 0: none
+    clip: float,  # 0: no clipping
     scale: float,
     of_values: wp.array2d[float],
     terms: wp.array2d[float],

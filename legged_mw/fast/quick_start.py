@@ -1,14 +1,14 @@
-"""Start a program faster: no garbage collection, a CUDA context beside the imports, torch's compiler on first use.
+"""Start a program faster: no garbage collection, a CUDA context in parallel with imports, torch's compiler on demand.
 
 tensordict (on import) and torch's optimizers (on the first call) mark functions for torch's compiler. Both import
-``torch._dynamo``, some 900 modules, though no training compiles. A stand-in for the module records the marks. Any other
-use of it imports the compiler and applies the marks.
+``torch._dynamo``, about 900 modules, although no training compiles. A stand-in for the module records the marks. Any
+other use of the stand-in imports the compiler and applies the marks.
 
-``Tensor.backward(gradient)`` compares shapes as symbolic ones, which imports sympy, some 470 modules. A second stand-in
-compares shapes of plain numbers.
+``Tensor.backward(gradient)`` compares shapes as symbolic shapes, which imports sympy, about 470 modules. A second
+stand-in compares shapes of plain numbers.
 
-For a training of two iterations on a CPU the stand-ins cut 6.7 s of CPU time to 3.7, and no collection saves another
-1.0 (medians of six).
+In a training of two iterations on a CPU, the stand-ins reduce 6.7 s of CPU time to 3.7 s. No garbage collection saves
+another 1.0 s (medians of six).
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ Marked = Callable[..., Any]
 
 
 def begin(gpu: str | None = "cpu") -> None:
-    """Call it before torch is imported. No garbage is collected until ``settle`` of utils/machine.
+    """Call this before the import of torch. Garbage collection stays off until ``settle`` of utils/machine.
 
-    ``gpu`` is the wanted device: "cpu", "cuda:0", or None for the GPU of this process, if there is one.
+    ``gpu``: the requested device "cpu" or "cuda:0"; None: the GPU of this process, if it has one.
     """
     if "torch" in sys.modules:
-        return  # torch is imported already: another program calls this one
-    gc.disable()  # a start makes a million lasting objects; scanning them takes a third of its time
+        return  # torch is already imported, because another program calls this one
+    gc.disable()  # a start makes a million permanent objects; scanning them takes a third of the time
     index = os.environ.get("LOCAL_RANK", "0") if gpu is None else gpu.removeprefix("cuda").removeprefix(":") or "0"
-    if index.isdecimal():  # other names are no GPU
+    if index.isdecimal():  # other names are not GPUs
         Thread(target=open_gpu, args=(int(index),), daemon=True).start()
     put_off_compiler()
 
 
 def open_gpu(index: int) -> bool:
-    """Create a GPU's primary context, which torch and warp share; False without a GPU. Other threads run on."""
+    """Create the primary context of a GPU, which torch and warp share; False without a GPU. Other threads continue."""
     try:
         cuda = ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -64,7 +64,7 @@ def open_gpu(index: int) -> bool:
 
 
 def put_off_compiler() -> bool:
-    """Install stand-ins for torch's compiler; False if it is imported already, or torch's version is unknown."""
+    """Install stand-ins for torch's compiler; False if it is already imported, or if torch's version is unknown."""
     import torch
 
     version = tuple(int(part) for part in torch.__version__.split(".")[:2])
@@ -80,13 +80,13 @@ def put_off_compiler() -> bool:
 
 
 class _StandIn(ModuleType):
-    """A stand-in for a module, which is imported when an attribute is read that the stand-in lacks."""
+    """A stand-in for a module. It imports the module when an attribute is read that the stand-in lacks."""
 
-    _lock = RLock()  # one lock, as the modules import each other
+    _lock = RLock()  # one lock, because the modules import each other
 
     def __init__(self, name: str, file: str) -> None:
         super().__init__(name)
-        self.__file__ = str(Path(sys.modules["torch"].__file__ or "").parent / file)  # inspect reads it of every module
+        self.__file__ = str(Path(sys.modules["torch"].__file__ or "").parent / file)  # inspect reads it
         self.__spec__ = ModuleSpec(name, None, origin=self.__file__)  # for importlib.util.find_spec
 
     def __getattr__(self, name: str) -> Any:  # also `__path__`, read before a submodule is imported
@@ -103,10 +103,10 @@ class _StandIn(ModuleType):
 
 
 class _Shapes(_StandIn):
-    """Two functions of torch's symbolic shapes, for plain numbers."""
+    """Two functions of torch's symbolic shapes for plain numbers."""
 
     def __getattr__(self, name: str) -> Any:
-        if name == "__path__":  # read by `from`: there is no submodule
+        if name == "__path__":  # `from` reads it: there is no submodule
             raise AttributeError(name)
         return super().__getattr__(name)
 
@@ -122,14 +122,14 @@ class _Rules(_StandIn):
     """The compiler's rules; a process group clears their cache."""
 
     def clear_lru_cache(self) -> None:
-        """There is no cache yet."""
+        """No effect: there is no cache yet."""
 
     def _real(self) -> ModuleType:
         return importlib.import_module(self.__name__)
 
 
 class _Compiler(_StandIn):
-    """Records marks, which have no effect until a function is compiled; any other use imports the compiler."""
+    """Records marks, which have no effect until a function is compiled. Any other use imports the compiler."""
 
     def __init__(self, name: str, file: str) -> None:
         super().__init__(name, file)
@@ -152,7 +152,7 @@ class _Compiler(_StandIn):
         return fn
 
     def graph_break(self, msg: str = "") -> None:
-        """Nothing is compiled, so there is no graph to break."""
+        """No effect: nothing is compiled."""
 
     def _hand_over(self, module: ModuleType) -> None:
         for name, fn in self._marks:
@@ -164,7 +164,7 @@ class _Compiler(_StandIn):
 
 
 class _Found:
-    """Finds and loads modules that the compiler's own import already ran, so that they do not run twice."""
+    """Finds and loads modules that the compiler's import already ran, so that they do not run again."""
 
     def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
         there = name.startswith(f"{_COMPILER}.") and target is None and name in sys.modules

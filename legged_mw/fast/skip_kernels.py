@@ -1,7 +1,7 @@
-"""Skip the mujoco_warp kernels that compute nothing that is read. The state stays bit-identical.
+"""Skip mujoco_warp kernels whose results are not used. The state stays bit-identical.
 
 mujoco_warp launches its kernels through ``warp.launch`` and ``warp.launch_tiled``. While a substep runs or is recorded,
-these two skip the kernels named here, and ``array.zero_`` skips arrays that are already zero. The library itself is not
+these functions skip the kernels named here, and ``array.zero_`` skips arrays that are already zero. The library is not
 changed, and a kernel with an unknown name is launched. ``KNOWN`` lists the tested versions; with another version
 nothing is skipped. tests/fast/test_shortcuts.py compares the steps.
 
@@ -24,7 +24,7 @@ import warp as wp
 from legged_mw.fast.contact_count import count_contacts
 
 KNOWN = ("4.0.0",)  # of mujoco-warp
-_ALONE = threading.RLock()  # warp.launch is shared by all threads
+_ALONE = threading.RLock()  # all threads share warp.launch
 # the line search of an iteration; the last kernel of a solve
 _SEARCH, _SOLVED = "_linesearch_iterative_kernel", "_qfrc_constraint_from_grad"
 # kernels after the line search with results that sensors read: forces of constraint rows
@@ -43,7 +43,7 @@ class Shortcuts:
     ) -> None:
         option, kinds = model.opt, mujoco.mjtSensor
         known = mjw.__version__ in KNOWN
-        # a world without constraint rows gets the same acceleration from its first iteration, to float32 rounding
+        # a world without constraint rows gets the same acceleration from its first iteration, up to float32 rounding
         if known:
             option.run_qacc_smooth = False
         plain = (
@@ -77,12 +77,12 @@ class Shortcuts:
             and not option.enableflags & mjw.EnableBit.ENERGY
         ):
             self._zero.add(data.energy.ptr)
-        # contact sensors without reduction, or reduced to the net force
+        # contact sensors without reduction, or with the net force
         if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:
             self._idle.add("_contact_sort")
         if not mj.ntendon and not mj.neq and joints_alone:
             self._idle_unsensed.add("_site_local_to_global")
-        if self._iterations == 1:  # only the convergence test and later iterations read its result
+        if self._iterations == 1:  # only the convergence test and later iterations use its result
             self._idle.add("_update_gradient_zero_grad_dot")
 
     @contextmanager
@@ -133,7 +133,7 @@ class _Skip:
 
     def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str]) -> None:
         self._idle, self._iterations, self._keep = idle, iterations, keep
-        self._searches = 0  # of the solve that runs
+        self._searches = 0  # number of line searches in the current solve
 
     def __contains__(self, kernel: str) -> bool:
         if kernel in self._idle:
@@ -147,7 +147,7 @@ class _Skip:
 
     def around(self, launch: Callable[..., Any]) -> Callable[..., Any]:
         def launch_unless_skipped(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
-            name = kernel.key.partition("__locals__")[0]  # of the function that makes it
+            name = kernel.key.partition("__locals__")[0]  # name of the function that makes the kernel
             return None if name in self else launch(kernel, *args, **kwargs)
 
         return launch_unless_skipped

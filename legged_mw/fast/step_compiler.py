@@ -1,4 +1,4 @@
-"""Fuse a step: trace it, compile it, and compare it with the original before it is used."""
+"""Fuse a step: trace it, compile it, and compare it with the original before its use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.fast.trace import Call, Trace, alike
 
-_WORTH = 5_000  # control steps, below which compiling on a CPU (seconds, once a machine) does not pay
+_WORTH = 5_000  # control steps; with fewer, compiling on a CPU (seconds, once per machine) does not save time
 _CLOSE, _STRAYS = (
     1e-3,
     0.01,
@@ -20,7 +20,7 @@ _CLOSE, _STRAYS = (
 
 
 def fuse(env: RobotTask, steps: int) -> None:
-    """Fuse the step of ``env``: on a CPU now, if it pays over ``steps``; on a GPU before it is recorded."""
+    """Fuse the step of ``env``: on a CPU now, if that saves time over ``steps``; on a GPU before the recording."""
     if not env.cfg.sim.fuse or env.eager:
         return
     if str(env.device) != "cpu":
@@ -31,7 +31,7 @@ def fuse(env: RobotTask, steps: int) -> None:
 
 
 def fused_step(env: RobotTask) -> Callable[[], None]:
-    """The fused step of ``env``, or the original. No world moves and no number is drawn."""
+    """The fused step of ``env``, or the original step. It changes no world and draws no random number."""
     state = env.sim.memory()
     fields = [value for name, value in state.items() if name.startswith("model.")] if env.sim.engine == "mujoco" else []
     return fused(env._step, env.num_envs, everything(env), fields)
@@ -40,15 +40,15 @@ def fused_step(env: RobotTask) -> Callable[[], None]:
 def fused(
     fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor] = ()
 ) -> Callable[[], None]:
-    """Fuse the step ``fn`` of ``worlds``; if that fails, print why and return ``fn``. In the end no world has moved.
+    """Fuse the step ``fn`` of ``worlds``. If that fails, print the reason and return ``fn``. No world changes.
 
-    ``memory`` is all that ``fn`` writes, by name. Only torch may write to what is ``watched``.
+    ``memory``: all tensors that ``fn`` writes, by name. Only torch may write tensors in ``watched``.
     """
     put_back = None
     try:
         put_back = remember(memory)
         program, reason = _fused(fn, worlds, memory, watched, put_back), ""
-    except Exception as error:  # an error of any compiler, or no memory for a copy: keep the original step
+    except Exception as error:  # any error of a compiler, or no memory for a copy: keep the original step
         program, reason = None, " ".join(f"{error}".split())[:200] or type(error).__name__
     if put_back:
         put_back()
@@ -76,7 +76,7 @@ def _fused(
     if wrong := program.verify():
         print(f"{wrong} of {len(program.parts)} parts of the step are not fused: they gave other values", flush=True)
     put_back()
-    for block in trace.made:  # the step writes each before it reads it
+    for block in trace.made:  # the step writes each of them before it reads it
         trace.blocks[block].fill_(float("nan") if trace.blocks[block].is_floating_point() else 1)
     other, calls = set[str](), iter(trace.calls)
 
@@ -94,7 +94,7 @@ def _fused(
             memory[name].copy_(value)
     compare(expected)
     if other:
-        names = sorted(other, key=lambda name: (name.startswith("sim."), name))  # the task's own first
+        names = sorted(other, key=lambda name: (name.startswith("sim."), name))  # the task's tensors first
         shown, are = (
             ", ".join(names[:5]) + ", ..." * (len(names) > 5),
             "is another" if len(names) == 1 else "are others",
@@ -106,10 +106,10 @@ def _fused(
 
 
 class _Recorder(Trace):
-    """A trace that also keeps the parts of ``memory`` that each call of the simulator changes, before and after it.
+    """A trace that also stores the parts of ``memory`` that each call of the simulator changes, before and after.
 
-    A simulator may not repeat: on a GPU contacts come in random order, and an overflow drops random ones. So a fused
-    step is compared between these calls, and each call's recorded result replaces the call.
+    A simulator may not be reproducible: on a GPU the order of contacts is random, and an overflow drops random ones.
+    So a fused step is compared between these calls, and the recorded result replaces each call.
     """
 
     def __init__(self, memory: Mapping[str, Tensor], watched: Iterable[Tensor]) -> None:
@@ -128,14 +128,14 @@ class _Recorder(Trace):
 
 
 def remember(memory: Mapping[str, Tensor]) -> Callable[[], None]:
-    """Save ``memory`` and torch's generators; returns a function that restores them."""
+    """Save ``memory`` and torch's random states. Returns a function that restores them."""
     kept, draws = {name: value.clone() for name, value in memory.items()}, torch.get_rng_state()
     device = next(iter(memory.values())).device
     draws_there = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
 
     def put_back() -> None:
         for name, value in kept.items():
-            if not torch.equal(memory[name], value):  # unchanged memory must not count as written
+            if not torch.equal(memory[name], value):  # unchanged memory must not be marked as written
                 memory[name].copy_(value)
         torch.set_rng_state(draws)
         if draws_there is not None:

@@ -1,6 +1,6 @@
-"""Trace a step: torch's operations on memory, in order, and the calls of the simulator between them.
+"""Trace a step: torch's operations on memory, in order, and the simulator's calls between them.
 
-The trace records one real call. It identifies memory by address, so views cost nothing and a write in place is a write.
+The trace records one real call. It identifies memory by address, so a view needs no operation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from legged_mw.utils.opaque import traces
 
 
 class View(NamedTuple):
-    """A tensor's place: a block of memory, shape, strides and offset in elements."""
+    """The memory of a tensor: block, shape, strides, and offset in elements."""
 
     block: int
     dtype: torch.dtype
@@ -27,7 +27,7 @@ class View(NamedTuple):
 
 
 class Node(NamedTuple):
-    """A node: an operation with its arguments, the memory that it reads and the memory that it writes."""
+    """An operation with its arguments, the memory that it reads and the memory that it writes."""
 
     func: Any  # torch's OpOverload
     args: tuple[Any, ...]
@@ -38,37 +38,37 @@ class Node(NamedTuple):
 
     @property
     def name(self) -> str:
-        """torch's name without the form of its output: ``add`` for ``add_`` and ``add.out``."""
+        """torch's name without the variant: ``add`` for ``add_`` and ``add.out``."""
         return self.func._schema.name.removeprefix("aten::").strip("_") if hasattr(self.func, "_schema") else ""
 
     @property
     def random(self) -> bool:
-        """Whether it draws from the generator."""
+        """Whether it uses the random generator."""
         return torch.Tag.nondeterministic_seeded in self.func.tags
 
 
 class Call(NamedTuple):
-    """An opaque call, and the blocks of memory that it is given."""
+    """An opaque call, and the blocks of memory that it may read."""
 
     run: Callable[[], object]
     given: tuple[int, ...]
 
 
 class Trace(TorchDispatchMode):
-    """A context manager that records every operation and runs it."""
+    """A context manager that runs and records every operation."""
 
     def __init__(self, watched: Iterable[Tensor] = ()) -> None:
-        """``watched``: only torch may write this memory, since others detect writes by torch's version counter."""
+        """``watched``: only torch may write this memory, because others detect writes by torch's version counter."""
         super().__init__()
         self.steps: list[Node | Call] = []
-        self.blocks: list[Tensor] = []  # a tensor of each block of memory, which keeps it allocated
+        self.blocks: list[Tensor] = []  # one tensor of each block of memory, so that it stays allocated
         self.made: set[int] = set()  # blocks that were allocated during the trace
         self._known: dict[int, int] = {}
         self.watched = {self.view(tensor).block for tensor in watched}
         self._paused = False
 
     def view(self, tensor: Tensor, made: bool = False) -> View:
-        """The place of ``tensor``. Its memory is kept allocated."""
+        """The memory of ``tensor``, which stays allocated."""
         address = tensor.untyped_storage().data_ptr()
         if address not in self._known:
             self._known[address] = len(self.blocks)
@@ -100,7 +100,7 @@ class Trace(TorchDispatchMode):
         return result
 
     def call(self, run: Callable[[], object], given: Iterable[Tensor] = ()) -> Any:
-        """Run an opaque call; of the trace's own memory it may read what it is ``given``. A returned tensor is kept."""
+        """Run an opaque call. Of the trace's own memory it may read only ``given``. A returned tensor is stored."""
         self._paused = True
         try:
             result = run()
@@ -115,7 +115,7 @@ class Trace(TorchDispatchMode):
         return result
 
     def call_whole(self, method: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a method marked ``not_traced``."""
+        """Run a method with the mark ``not_traced``."""
         if self._paused:
             return method(*args, **kwargs)
         return self.call(lambda: method(*args, **kwargs), _tensors((args, kwargs)))
@@ -142,9 +142,9 @@ def _written(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Iterator
 
 
 def alike(expected: Tensor, value: Tensor, close: float, strays: float) -> bool:
-    """Equal to ``close``, relative and absolute, but for a share of ``strays``.
+    """Whether the values are equal within ``close`` (relative and absolute), except for a share of ``strays``.
 
-    Fewer than 100 values must each be equal to a hundredth. Reads the device.
+    With fewer than 100 values, each must be equal within 0.01. Reads the device.
     """
     few = value.numel() < 100
     if few:

@@ -33,7 +33,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--rate", type=number(Positive), default=50.0, metavar="F", help="frames a second to resample to (default: 50)"
     )
-    parser.add_argument("--cut", type=number(float), nargs=2, metavar=("FROM", "TO"), help="keep these seconds alone")
+    parser.add_argument("--cut", type=number(float), nargs=2, metavar=("FROM", "TO"), help="keep only these seconds")
     parser.add_argument("--lift", type=number(float), default=0.0, metavar="M", help="raise it by so many metres")
     parser.add_argument("--out", metavar="CLIP.npz", help="write the clip that a task can follow")
     parser.add_argument("--play", action="store_true", help="show it")

@@ -48,9 +48,9 @@ def _read_csv(path: Path, robot: RobotModel, fps: float) -> Clip:
         raise ClipError(f"{path} cannot be read as a CSV of numbers: {error}") from None
     count = 7 + len(robot.joint_names)
     if table.shape[1:] != (count,):
-        got = table.shape[1] if table.ndim > 1 else 0
+        columns = table.shape[1] if table.ndim > 1 else 0
         raise ClipError(
-            f"{path} has {got} columns; of this robot it must have {count}: root x y z, quaternion x y z w, then the joints"
+            f"{path} has {columns} columns; of this robot it must have {count}: root x y z, quaternion x y z w, then the joints"
         )
     return checked(path, fps, robot.joint_names, table[:, :3], table[:, [6, 3, 4, 5]], table[:, 7:])
 
@@ -74,20 +74,20 @@ def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: fl
     if not rate:
         raise ClipError(f"{path} does not say how many frames a second it has; say --fps")
     places, turns = held["body_pos_w"], held["body_quat_w"]
-    found = {}
+    distances = {}
     for words, names in {
         "as in the robot's file": list(robot.joint_names),
         "breadth first": breadth_first(robot),
     }.items():
         clip = checked(path, rate, names, places[:, 0], turns[:, 0], held["joint_pos"]).of(robot.joint_names, str(path))
-        found[words] = (
+        distances[words] = (
             max(_apart(robot, clip, places, frame) for frame in np.linspace(0, len(places) - 1, 5).astype(int)),
             clip,
         )
-    apart, clip = min(found.values(), key=lambda each: each[0])
+    apart, clip = min(distances.values(), key=lambda each: each[0])
     if apart > APART:
         raise ClipError(
-            f"{path}: with its joints in either order ({', '.join(found)}) bodies are {apart:.2f} m from where it says; another robot?"
+            f"{path}: with its joints in either order ({', '.join(distances)}) bodies are {apart:.2f} m from where it says; another robot?"
         )
     return clip
 

@@ -40,18 +40,18 @@ def page(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> str:
 
 def wrong(robot: RobotModel, clip: Clip, lowest: float, slide: float) -> list[str]:
     """The faults of the clip, one line each."""
-    found, (low, high) = [], robot.joint_range.T
+    faults, (low, high) = [], robot.joint_range.T
     beyond = np.maximum(low - clip.joint_pos, clip.joint_pos - high)
     for joint in np.flatnonzero(beyond.max(axis=0) > BEYOND):
         far, limits = beyond[:, joint].max(), f"{low[joint]:.2f} to {high[joint]:.2f}"
-        found.append(
+        faults.append(
             f"{clip.joint_names[joint]} is {far:.3f} rad beyond its range ({limits}) after {_when(clip, beyond[:, joint])}"
         )
     if lowest < -DEEP:
-        found.append(f"a foot is {-1000 * lowest:.0f} mm in the ground; --lift {-lowest:.3f} raises the clip")
+        faults.append(f"a foot is {-1000 * lowest:.0f} mm in the ground; --lift {-lowest:.3f} raises the clip")
     if slide > SLIDING:
-        found.append(f"a foot slides on the ground at {slide:.2f} m/s")
-    return found
+        faults.append(f"a foot slides on the ground at {slide:.2f} m/s")
+    return faults
 
 
 def _when(clip: Clip, values: Floats) -> str:

@@ -1,1 +1,1 @@
-"""The learner: rsl-rl, fed from class configs. The only package that imports rsl_rl's algorithms and runners."""
+"""The learner: rsl-rl with class configs. Only this package imports rsl_rl's algorithms and runners."""

@@ -20,7 +20,7 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
     parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
     source = "its run, checkpoint or export, or a task for its last or shipped policy"
     parser.add_argument(
-        "--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}"
+        "--teacher", metavar="RUN", help=f"distil: imitate a policy that may have more observations; {source}"
     )
     parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
     parser.add_argument(
@@ -33,7 +33,7 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
         "--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen"
     )
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
-    parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
+    parser.add_argument("--check", action="store_true", help="describe the task and exit")
     parser.add_argument(
         "--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot"
     )
@@ -45,9 +45,9 @@ def parse(description: str | None, argv: list[str] | None = None) -> argparse.Na
     if not args.list:
         require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
-        parser.error("--load_run and --checkpoint say what to go on with: add --resume")
+        parser.error("--load_run and --checkpoint select what to resume: add --resume")
     if args.resume and (args.teacher is not None or args.init is not None):
-        parser.error("--resume goes on with what a run began with: leave --teacher and --init out")
+        parser.error("--resume keeps the teacher and start of the run: leave --teacher and --init out")
     args.deadline = time.time() + args.max_time if args.max_time else None
     return args
 

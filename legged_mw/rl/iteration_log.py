@@ -236,7 +236,9 @@ class Console:
             return write()
         except OSError as error:
             self._file = None
-            print(f"WARNING: {LOG_FILE} cannot be written ({error.strerror}); training goes on without", flush=True)
+            print(
+                f"WARNING: {LOG_FILE} cannot be written ({error.strerror}); training continues without it", flush=True
+            )
             return None
 
     def _seconds(self, iterations: int) -> float:
@@ -360,7 +362,7 @@ class FiniteCheck:
             columns = list(dict.fromkeys(name for name, bad in zip(self._stored, wrong, strict=True) if bad))
             cause, advice = "loss or weights", "lower algorithm.learning_rate; look for rewards without a bound"
             if columns:
-                cause = f"{' and '.join(columns[:4])} held what is not finite or beyond {BOUND:g}"
+                cause = f"{' and '.join(columns[:4])} had values that are not finite or beyond {BOUND:g}"
                 advice = "look at how that is computed"
             count = f"{self._undone_in_a_row} in a row, {self.undone} so far"
             warnings.append(f"the update was not finite ({cause}) and is undone: {count}")

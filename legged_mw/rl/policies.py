@@ -113,7 +113,7 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Pol
     rival_task = str(load_yaml(rival.folder / CONFIG_FILE).get("task", task.name))
     if Path(rival_task).stem != task.name:
         raise ConfigError(
-            f"--compare {run} is of task '{rival_task}', not '{task.name}': two policies are graded on one task"
+            f"--compare {run} is of task '{rival_task}', not '{task.name}': both policies must have the same task"
         )
     return rival
 
@@ -290,7 +290,7 @@ def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
         model.load_state_dict(read_actor(path, model, TEACHER))
     except ConfigError as error:
         rows = env.observations.groups[TEACHER]
-        raise ConfigError(f"{error}; it is shown {sum(row.size for row in rows)} values: {_in_words(rows)}") from None
+        raise ConfigError(f"{error}; it gets {sum(row.size for row in rows)} values: {_in_words(rows)}") from None
 
 
 def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
@@ -308,10 +308,7 @@ def begin_with(model: MLPModel, policy: Trained) -> None:
     """Load the actor's parameters into ``model``, except its exploration noise. Raises ConfigError."""
     path, own = policy.source.checkpoint, model.state_dict()
     if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
-        raise ConfigError(
-            f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; "
-            "name a checkpoint"
-        )
+        raise ConfigError(f"{shown(path)} has only the student, not the teacher's encoder; name a checkpoint")
     saved = read_actor(path, model)
     # the normalisers of observations and of targets
     for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:

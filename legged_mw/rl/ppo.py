@@ -142,7 +142,7 @@ class GraphedPPO(Recorded, PPO):
         if reason:
             if self._bound:
                 raise ConfigError(
-                    f"algorithm.max_learning_rate is of the recorded update, and this is rsl-rl's own: {reason}"
+                    f"algorithm.max_learning_rate needs the recorded update, and rsl-rl's own runs: {reason}"
                 )
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
@@ -367,8 +367,8 @@ class GraphedPPO(Recorded, PPO):
             kl = None  # the actor did not change, so the KL is rounding noise
         else:
             gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # affects the estimator only
-            wanted = [(value, gradient) for value, gradient in gradients if value.requires_grad]
-            torch.autograd.backward(*zip(*wanted, strict=True))  # type: ignore[arg-type]
+            trained = [(value, gradient) for value, gradient in gradients if value.requires_grad]
+            torch.autograd.backward(*zip(*trained, strict=True))  # type: ignore[arg-type]
         self._meet()
         self._step(kl)
         self._losses.add_(torch.stack([value.detach() for value in (of_critic, *parts, *regression)]))

@@ -47,7 +47,7 @@ def rank_device(rank: Rank, device: str | None) -> str | None:
         return device
     if device is not None:
         raise ConfigError(
-            f"--device {device}: under torchrun every process takes the GPU of its own number; leave --device out"
+            f"--device {device}: under torchrun each process uses the GPU with its local rank; leave --device out"
         )
     if rank.local >= torch.cuda.device_count():
         seen = torch.cuda.device_count()

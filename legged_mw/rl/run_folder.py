@@ -480,16 +480,18 @@ def check_resume(
                 raise ValueError("other parameters or settings")
         if adam and done and not saved["state"]:
             raise ValueError(f"no state after {done} iterations")
-        moments, wanted = dict[str, Tensor](), dict[str, Tensor]()
+        moments, expected = dict[str, Tensor](), dict[str, Tensor]()
         for i, held in saved["state"].items():
             moments |= {f"{i}.{name}": value for name, value in held.items()}
             for name in ("step", "exp_avg", "exp_avg_sq") if adam else held:
-                wanted[f"{i}.{name}"] = torch.zeros(()) if name == "step" else parameters[i]
-        check_fit(moments, wanted, path, "optimizer_state_dict")
+                expected[f"{i}.{name}"] = torch.zeros(()) if name == "step" else parameters[i]
+        check_fit(moments, expected, path, "optimizer_state_dict")
     with _part(path, "infos.env"):
         levels = {**(content.get("infos") or {}).get("env", {})}
-        wanted = {name: _resized(value, levels[name]) for name, value in own["infos"]["env"].items() if name in levels}
-        check_fit({name: levels[name] for name in wanted}, wanted, path, "infos.env")
+        expected = {
+            name: _resized(value, levels[name]) for name, value in own["infos"]["env"].items() if name in levels
+        }
+        check_fit({name: levels[name] for name in expected}, expected, path, "infos.env")
 
 
 @contextlib.contextmanager

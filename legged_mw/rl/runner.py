@@ -232,7 +232,9 @@ class Runner(OnPolicyRunner):
         try:
             figures = self.examine(policy.eval())
         except Exception as error:  # a failed exam must not end a training
-            print(f"WARNING: the exam failed, training goes on without: {type(error).__name__}: {error}", flush=True)
+            print(
+                f"WARNING: the exam failed, training continues without it: {type(error).__name__}: {error}", flush=True
+            )
             self.examine = None
             return
         finally:
@@ -295,7 +297,7 @@ class Runner(OnPolicyRunner):
         self._all_stop = read.stop[0] > 0
         self.schedule.end_after(report.iteration, read.iterations_left[0])
         if verdict := self._divergence.verdict(numbers):
-            self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
+            self.diverged, self.stop = verdict, self.stop or "the simulated state is not finite"
         losses = dict(zip(report.losses, read.losses, strict=True))
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
@@ -465,11 +467,11 @@ class Runner(OnPolicyRunner):
             return f"{file.name} cannot be read: {' '.join(f'{error}'.split())}"
         same = state.keys() == random.keys() and all(torch.equal(state[key], random[key].cpu()) for key in state)
         if rank.leads and not same:
-            return f"{file.name} is of another checkpoint"
+            return f"{file.name} belongs to another checkpoint"
         if different := first_difference(there, here):
             return different
         if own.keys() != memories.keys() or any(own[key].shape != memories[key].shape for key in own):
-            return "the networks' memories are of another shape"
+            return "the networks' hidden states have another shape"
         if name := beyond(worlds, memory(self.env)) or beyond(memories, own):
             return f"{file.name}: {name} is not finite, or beyond {MOST:.0e}"
         if reason := put_snapshot(self.env, worlds):

@@ -277,15 +277,15 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
     """Load the checkpoint of a resumed run. Returns the number of iterations left."""
     if start.checkpoint:
         runner.load(str(start.checkpoint))
-    done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
-    if done >= wanted:
+    done, last = runner.current_learning_iteration, task.train.runner.max_iterations
+    if done >= last:
         what = shown(start.checkpoint or start.experiment)
-        raise ConfigError(f"{what} has done {done} iterations of {wanted}; raise --max_iterations to go on")
+        raise ConfigError(f"{what} has done {done} iterations of {last}; raise --max_iterations to go on")
     if start.checkpoint:
         print(f"resuming {shown(start.checkpoint)}")
         note = f"worlds begin anew ({runner.why_not_exact}); networks, counters and curricula go on"
         print(note if runner.why_not_exact else "exactly: worlds and generators go on where they were", flush=True)
-    return wanted - done
+    return last - done
 
 
 def _begin(runner: Runner, start: Start) -> None:
@@ -297,7 +297,7 @@ def _begin(runner: Runner, start: Start) -> None:
     if start.policy:
         begin_with(runner.alg.get_policy(), start.policy)
         if warmup := runner.cfg["critic_warmup"]:
-            print(f"the critic learns alone for {warmup} iterations (warm_start.critic_warmup)", flush=True)
+            print(f"only the critic learns for {warmup} iterations (warm_start.critic_warmup)", flush=True)
 
 
 def _lock(start: Start) -> RunLock:

@@ -28,7 +28,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--new", metavar="NAME", help="write NAME.xml and NAME_flat.py, a first task for the robot")
     parser.add_argument("--out", metavar="DIR", default=".", help="where --new writes (default: here)")
     parser.add_argument(
-        "--sim", action="store_true", help="--new writes a task for simulation alone: a told velocity, alike worlds"
+        "--sim", action="store_true", help="--new writes a task for simulation only: observed velocity, equal worlds"
     )
     parser.add_argument("--force", action="store_true", help="--new may overwrite")
     parser.add_argument(
@@ -53,16 +53,16 @@ def main() -> None:
         show_task(load_task(args.file, say=True), image)
         return
     if args.new:
-        # refuse before the page, not after it
+        # raise before the page is printed
         new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
-    found = draft(file, args.sim)
+    proposal = draft(file, args.sim)
     if args.new:
-        new.refuse_wheels(found, file)
-    env = as_env(found, file)
-    show(env, file.name, image, found)
+        new.refuse_wheels(proposal, file)
+    env = as_env(proposal, file)
+    show(env, file.name, image, proposal)
     if args.new:
         out, mirrors = Path(args.out), has_mirror(env)
-        written = new.write(found, file, args.new, out, force=args.force, mirrors=mirrors, pack=args.pack)
+        written = new.write(proposal, file, args.new, out, force=args.force, mirrors=mirrors, pack=args.pack)
         flags = shlex.join(["--task", shown(written[1]), "--check"])
         print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} {flags}")
 

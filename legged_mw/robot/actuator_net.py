@@ -1,10 +1,10 @@
-"""An actuator network in torchscript (legged_gym, walk-these-ways, Isaac Lab) as the .npz that `control.network` takes.
+"""Convert an actuator network in torchscript (legged_gym, walk-these-ways, Isaac Lab) to an .npz for `control.network`.
 
     python -m legged_mw.robot.actuator_net anydrive_v3_lstm.pt anydrive.npz
 
-Loading a torchscript file runs what is in it: convert files that you trust, once. Loading the .npz runs nothing. The weights are taken
-by their shapes. What the file computes and what the .npz computes is compared before anything is written: activation and scales are
-those for which they agree.
+Loading a torchscript file runs its code, so convert only files that you trust. Loading the .npz runs no code. The
+shapes of the weights give the layers. Activation and scales are those for which the outputs of both files agree.
+Nothing is written if they differ.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
         raise UserError(
             f"{file} is no torchscript file, which torch.jit.script(network).save(FILE) writes: {reason}"
         ) from None
-    found = _layers({name: value.detach().numpy() for name, value in module.state_dict().items()}, file)
-    width = (found.recurrent or found.linear)[0][0].shape[1]
+    converted = _layers({name: value.detach().numpy() for name, value in module.state_dict().items()}, file)
+    width = (converted.recurrent or converted.linear)[0][0].shape[1]
     frames = tuple(frames or range(width // 2))
     if width != 2 * len(frames):
         raise UserError(
             f"{file.name} takes {width} values a joint, and --frames means {2 * len(frames)}: an error and a speed of each"
         )
-    fed = replace(found, frames=frames, **layout)
+    fed = replace(converted, frames=frames, **layout)
     states = _states()
-    wanted = _theirs(module, fed, states)
+    expected = _theirs(module, fed, states)
     activations = [*ACTIVATIONS] if len(fed.linear) > 1 else [fed.activation]
-    fits = [_fit(replace(fed, activation=name), states, wanted) for name in activations]
+    fits = [_fit(replace(fed, activation=name), states, expected) for name in activations]
     network, gap = min(fits, key=lambda fit: fit[1])
     if not gap <= _TOLERANCE:
         raise UserError(
-            f"{file.name} computes something else than its layers with scaled inputs, by {gap:.1%} of the largest torque with the best "
-            f"activation, {network.activation}: is it fed otherwise (--frames, --in_turns)? See what it does with: "
+            f"{file.name} and its layers with scaled inputs have different outputs, by {gap:.1%} of the largest torque with the best "
+            f"activation, {network.activation}: does it have other inputs (--frames, --in_turns)? See its code with: "
             f"python -c 'import torch; print(torch.jit.load(\"{file}\").code)'"
         )
     return network, gap

@@ -121,7 +121,7 @@ def draft(file: Path, simple: bool = False) -> Draft:
     if height <= 0.0:
         names = ", ".join(foot.name for foot in feet)
         raise ModelError(
-            f"'{robot.root}', the root, is not above the lowest ends of limbs, {names}; the health page is of robots that stand on them"
+            f"'{robot.root}', the root, is not above the lowest ends of limbs, {names}; the health page needs a robot that stands on them"
         )
     gains, gains_from = _servos(robot, pose, place, joints, feet, maker)
     guessed = [

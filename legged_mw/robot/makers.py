@@ -1,4 +1,4 @@
-"""What makers publish about their robots: the entries of ``resources/makers.yaml``, found by name and joints."""
+"""The makers' published values of their robots: entries of ``resources/makers.yaml``, found by name and joints."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ FILE = "resources/makers.yaml"
 
 @dataclass(frozen=True)
 class Maker:
-    """The published numbers of a robot. Tables are of the form of ``some_joints``; an empty table is not known."""
+    """The published values of a robot. Tables have the form of ``some_joints``. An empty table is unknown."""
 
     name: str
-    joints: tuple[str, ...]  # patterns; each fits a joint of the robot
+    joints: tuple[str, ...]  # patterns; each must match a joint of the robot
     source: str  # repository and file
     pose: dict[str, float] = field(default_factory=dict)  # [rad]
     kp: dict[str, float] = field(default_factory=dict)  # [N m/rad]
@@ -30,17 +30,17 @@ class Maker:
     effort: dict[str, float] = field(default_factory=dict)  # [N m]
 
     def of(self, table: str, joints: Sequence[str]) -> dict[str, float]:
-        """Joint -> number of ``table``, a name of a field here, for those of ``joints`` that a key fits."""
-        said: dict[str, float] = getattr(self, table)
-        fitting = {key: value for key, value in said.items() if any(key in joint for joint in joints)}
+        """Joint -> value of ``table`` (a field of this class), for those of ``joints`` that a key matches."""
+        values: dict[str, float] = getattr(self, table)
+        fitting = {key: value for key, value in values.items() if any(key in joint for joint in joints)}
         return some_joints(fitting, joints, f"{FILE}: {self.name}: {table}")
 
 
 def find_maker(file: Path, model: str, joints: Sequence[str]) -> Maker | None:
-    """The entry of the robot in ``file``, whose model is called ``model``; None if there is none.
+    """The entry of the robot in ``file`` with the model name ``model``; None without an entry.
 
-    The name of the file comes first: some makers call the models of two robots alike. Of several names that are part
-    of it the longest wins. All patterns of the entry must fit ``joints``.
+    The file's name is searched first, because some makers give the models of two robots the same name. If several names
+    match, the longest is used. All patterns of the entry must match ``joints``.
     """
     known = [maker for maker in read_makers() if all(_fits(pattern, joints) for pattern in maker.joints)]
     for text in (file.stem, model):
@@ -51,13 +51,13 @@ def find_maker(file: Path, model: str, joints: Sequence[str]) -> Maker | None:
 
 
 def read_makers() -> list[Maker]:
-    """All entries of the file, in its order."""
+    """All entries of the file, in order."""
     entries = yaml.safe_load((ROOT / FILE).read_text(encoding="utf-8"))
     return [Maker(**{**entry, "joints": tuple(entry["joints"])}) for entry in entries]
 
 
 def _names(name: str, text: str) -> bool:
-    """Whether ``name`` is a part of ``text``, between its ends or signs: "h1" of "h1_2", but not of "h12"."""
+    """Whether ``name`` is a whole part of ``text``: "h1" is one of "h1_2", but not of "h12"."""
     return bool(re.search(rf"(?<![a-z0-9]){re.escape(name)}(?![a-z0-9])", text.lower()))
 
 

@@ -1,4 +1,4 @@
-"""Missing or unreadable meshes and textures: drop those of visuals, raise an error for those of the physics."""
+"""Handle missing or unreadable meshes and textures: drop those of visuals, raise an error for those of the physics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from legged_mw.sim.robot_file import compile_copy
 from legged_mw.utils.errors import ModelError
 
 READABLE = (".stl", ".obj", ".msh", ".dae")  # mesh formats of MuJoCo's reader, and ours
-FACES_OF_LOOKS, _FACES_OF_COLLIDERS = 5_000, 100_000  # more are thinned [ours: a link on a screen]
+FACES_OF_LOOKS, _FACES_OF_COLLIDERS = 5_000, 100_000  # larger meshes are thinned [ours: a link on a screen]
 INSTEAD = 'give the geom a primitive shape, or let it not collide (contype="0" conaffinity="0")'
 
 
@@ -105,7 +105,7 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
 
 
 def matters(geom: mujoco.MjsGeom) -> bool:
-    """Whether a geom is more than looks: it collides, or gives its body mass."""
+    """Whether a geom affects the physics: it collides, or gives its body mass."""
     return bool(geom.contype or geom.conaffinity) or _gives_mass(geom)
 
 
@@ -127,7 +127,7 @@ def _missing_pictures(spec: mujoco.MjSpec) -> dict[str, list[str]]:
         t.name: [file for file in (t.file, *t.cubefiles) if file and not path_of(spec, t, file).is_file()]
         for t in spec.textures
     }
-    return {name: gone for name, gone in files.items() if gone}
+    return {name: missing for name, missing in files.items() if missing}
 
 
 def _missing_skins(spec: mujoco.MjSpec) -> list[mujoco.MjsSkin]:
@@ -137,7 +137,7 @@ def _missing_skins(spec: mujoco.MjSpec) -> list[mujoco.MjsSkin]:
 def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """Remove skins and textures with missing files. The materials keep their colours."""
     missing = _missing_pictures(spec)
-    gone = [file for files in missing.values() for file in files] + [skin.file for skin in _missing_skins(spec)]
+    dropped = [file for files in missing.values() for file in files] + [skin.file for skin in _missing_skins(spec)]
     for skin in _missing_skins(spec):
         spec.delete(skin)
     for material in spec.materials:
@@ -145,5 +145,5 @@ def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
             material.textures = ["" if name in missing else name for name in material.textures]
     for texture in [texture for texture in spec.textures if texture.name in missing]:
         spec.delete(texture)
-    if gone:
-        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(gone))}")
+    if dropped:
+        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(dropped))}")

@@ -176,12 +176,12 @@ class _Reader:
     def _note(self, attribute: str, name: str) -> None:
         """Record a file or folder that an attribute names."""
         if self.source.file.suffix == ARCHIVE:
-            raise ValueError(f"{self.where}it names {name[:200]}; the model of an archive stands alone")
+            raise ValueError(f"{self.where}it names {name[:200]}; the model of an archive must need no other file")
         if self.source.alone and not Path(os.path.realpath(os.path.join(self.source.home, name))).is_relative_to(
             self.source.home
         ):
             raise ValueError(
-                f"{self.where}it names {name[:200]}, which lies outside of its own folder; an export stands alone"
+                f"{self.where}it names {name[:200]}, which lies outside of its own folder; an export must need no other file"
             )
         if attribute in _DIRS:
             self.source.folders[os.path.join(self.folder, name)] = None
@@ -211,7 +211,7 @@ def _text(file: Path) -> str:
         raise ValueError(f"no zip file that can be read: {error}") from None  # RuntimeError: it is encrypted
     names = ", ".join(entry.filename for entry in inside)[:200] or "nothing"
     raise ValueError(
-        f"it holds {names}; an export's holds {_INSIDE} alone, deflated and of {MOST_BYTES >> 20} MiB at most"
+        f"it holds {names}; that of an export holds only {_INSIDE}, deflated, of {MOST_BYTES >> 20} MiB at most"
     )
 
 

@@ -1,4 +1,4 @@
-"""Write a first task: NAME.xml, the robot alone, and NAME_flat.py, a config that is ready for training."""
+"""Write a first task: NAME.xml with the robot only, and NAME_flat.py with a config that is ready for training."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _COMMENTS = {
     "pos": "[m] standing, computed",
     "damping": "[N m s/rad] LOOK: likewise",
     "armature": "[kg m^2] of the rotors, published; the file has none",
-    "integrator": "explicit Euler does not bear these gains on such light limbs",
+    "integrator": "explicit Euler is unstable with these gains on such light limbs",
     "iterations": "with fewer the physics of light limbs is not solved [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "clip_actions": "so that a joint is moved by 1 rad at most",
@@ -91,7 +91,7 @@ def targets(name: str, folder: Path, file: Path, force: bool = False) -> tuple[P
     with naming(file):
         is_own = robot.exists() and file.exists() and robot.samefile(file) and not stands_alone(file)
     if is_own:
-        raise UserError(f"{shown(robot)} is the robot's own file, which stays as it is; say another name or --out DIR")
+        raise UserError(f"{shown(robot)} is the robot's own file and is not overwritten; use another name or --out DIR")
     there = [path for path in (robot, config) if path.exists()]
     if there and not force:
         raise UserError(
@@ -110,7 +110,7 @@ def write(
     mirrors: bool = False,
     pack: bool = True,
 ) -> list[Path]:
-    """Write both files into ``folder``, and with ``pack`` the robot's meshes and pictures into a folder beside them.
+    """Write both files into ``folder``. With ``pack``, copy the robot's meshes and pictures into a folder there.
 
     ``mirrors``: the robot is symmetric, see ``has_mirror``. Returns what was written. Raises UserError.
     """
@@ -132,13 +132,13 @@ def write(
 
 
 def class_name(name: str) -> str:
-    """``name`` in capitals: "my_dog" is MyDog; an underscore between digits stays, "h1_2" is H1_2."""
+    """``name`` in capitals: "my_dog" becomes MyDog. An underscore between digits stays: "h1_2" becomes H1_2."""
     capitals = "_".join(part[:1].upper() + part[1:] for part in name.split("_"))
     return re.sub(r"(?<!\d)_|_(?!\d)", "", capitals)
 
 
 def refuse_wheels(found: Draft, file: Path) -> None:
-    """Raise UserError for a robot on wheels: the servos of a draft turn to an angle, and a wheel turns at a speed."""
+    """Raise UserError for a robot on wheels: a draft's servos control angles, and a wheel needs a speed."""
     if found.wheels:
         raise UserError(
             f"{shown(file)} is on wheels: {', '.join(found.wheels)} have no range and end in a round collider, and a draft "
@@ -194,7 +194,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
 
 
 def _learner(found: Draft, train: str) -> list[str]:
-    """The learner's sections. What is hard for a beginner on a few cores is off there."""
+    """The learner's sections. Features that are difficult on a few cores are off."""
     std = f"{train}.actor.distribution_cfg"
     if found.simple:
         lines = [f"    class runner({train}.runner):", "        max_iterations = 1500"]
@@ -217,7 +217,7 @@ def _learner(found: Draft, train: str) -> list[str]:
 
 
 def _before_a_real_robot(found: Draft) -> str:
-    """What a real robot needs to know, in order, as comments."""
+    """Comments with the facts that a real robot needs, in order."""
     known = all(joint.effort != float("inf") for joint in found.joints)
     effort = "the file's limits" if known else "some joints have none, which no motor is"
     text = _REAL.format(imu=f"site '{found.robot.imu}' of '{found.robot.root}'", effort=effort)
@@ -268,7 +268,7 @@ def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
     ]
 
 
-# ---- the robot alone, as MJCF text that names no other file by an absolute path -------------------------------------
+# ---- the robot only, as MJCF text without absolute paths ------------------------------------------------------------
 
 
 def stands_alone(file: Path) -> bool:
@@ -295,7 +295,7 @@ def as_mjcf(name: str, file: Path, folder: Path, parts: Path | None = None) -> s
         new = {} if parts is None else _copied(spec, paths, parts)
         materials = {material.name for material in spec.materials}
         for default in [geom.classname.geom for geom in spec.geoms]:
-            if default.material not in materials:  # of no element, as each overrides it by ""
+            if default.material not in materials:  # no element uses it, because each overrides it by ""
                 default.material = ""
         text = spec.to_xml()
     for path in {*paths, *new}:
@@ -306,13 +306,13 @@ def as_mjcf(name: str, file: Path, folder: Path, parts: Path | None = None) -> s
 
 def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
     """Give meshes, skins and textures absolute paths, and return these. Missing files keep their paths."""
-    found: set[Path] = set()
+    paths: set[Path] = set()
 
     def named(item: mujoco.MjsMesh | mujoco.MjsTexture | mujoco.MjsSkin, file: str) -> str:
         own = item.compiler.texturedir if isinstance(item, mujoco.MjsTexture) else item.compiler.meshdir
         places = [path_of(spec, item, file), *(Path(folder) / own / file for folder in folders)]
         path = next((place.resolve() for place in places if file and place.is_file()), None)
-        found.update([path] if path else [])
+        paths.update([path] if path else [])
         return str(path) if path else file
 
     for item in (*spec.meshes, *spec.textures, *spec.skins):
@@ -320,11 +320,11 @@ def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
     for texture in spec.textures:
         texture.cubefiles = [named(texture, file) for file in texture.cubefiles]
     spec.meshdir, spec.texturedir, spec.strippath = "", "", False
-    return found
+    return paths
 
 
 def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[Path, Path]:
-    """Copy files into ``parts``, looks thinned, and return old -> new place. Meshes in the text become files, too."""
+    """Copy files into ``parts``, with thinned visuals. Return old -> new path. Inline meshes also become files."""
     new: dict[Path, Path] = {}
     long = [mesh for mesh in spec.meshes if len(mesh.userface) > _SHORT and not len(mesh.usertexcoord)]
     if paths or long:
@@ -338,7 +338,7 @@ def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[P
         meshes = [mesh for mesh in spec.meshes if mesh.file == str(path)]
         look = None
         if meshes and all(_is_look(spec, mesh) for mesh in meshes):
-            with suppress(ValueError):  # MuJoCo alone reads it, such as a .msh
+            with suppress(ValueError):  # only MuJoCo can read it, such as a .msh
                 look = thinned(path, FACES_OF_LOOKS)
         name = path.name if look is None else f"{path.stem}.stl"
         new[path] = parts.resolve() / _unused(name, new.values())
@@ -352,7 +352,7 @@ def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[P
 
 
 def _is_look(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
-    """Whether a mesh is shown alone, in one colour, so that its exact shape does not matter."""
+    """Whether a mesh is only visual and has one colour, so that its exact shape does not matter."""
     geoms = [geom for geom in spec.geoms if geom.meshname == mesh.name]
     pictured = {material.name for material in spec.materials if any(material.textures)}
     worn = {mesh.material, *(geom.material for geom in geoms)}
@@ -360,7 +360,7 @@ def _is_look(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> bool:
 
 
 def _unused(name: str, taken: Iterable[Path]) -> str:
-    """A file name from ``name`` that none of ``taken`` has, also where capitals do not count."""
+    """A file name from ``name`` that differs from all of ``taken``, also without regard to capitals."""
     name = re.sub(r"[^\w.-]", "_", name)
     names = {path.name.lower() for path in taken}
     stem, dot, ending = name.rpartition(".")

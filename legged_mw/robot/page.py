@@ -25,7 +25,7 @@ from legged_mw.robot.measure import (
 from legged_mw.utils.errors import in_short, place_of
 from legged_mw.utils.task import LoadedTask
 
-_GROWS = 1e-6  # a mode grows if its factor is above 1 by more than this; less is rounding in the root's modes
+_GROWS = 1e-6  # a mode is unstable if its factor exceeds 1 by more; less is rounding error in the root's modes
 _TIP = 0.3  # [rad] with a larger sag, a joint stands away from the default pose
 _HEAD = (
     "joint",
@@ -59,9 +59,9 @@ def page(
         lines += ["poses that were judged", *(f"  {line}" for line in poses)]
     if changed:
         lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in changed)]
-    found = [*faults(health), *doubtful(health, gains)]
+    remarks = [*faults(health), *doubtful(health, gains)]
     return "\n".join(
-        [*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])]
+        [*lines, "what to look at", *(f"  - {line}" for line in remarks or ["nothing: all numbers are within bounds"])]
     )
 
 
@@ -144,7 +144,7 @@ def _those(which: Sequence[Joint]) -> str:
 
 
 def faults(health: RobotNumbers) -> list[str]:
-    """Faults that no training can compensate, one line each: the fault, its place, the config field that fixes it."""
+    """Faults that prevent training, one line each: the fault, its place, and the config field that fixes it."""
     dt, joints, lines = health.dt, health.joints, []
     if bad := [joint for joint in joints if joint.verdict(dt, health.implicit) == "unstable"]:
         lines.append(
@@ -153,7 +153,7 @@ def faults(health: RobotNumbers) -> list[str]:
         )
     elif health.mode.growth > 1.0 + _GROWS:
         lines.append(
-            f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains"
+            f"each servo is stable alone, but all together are unstable ({', '.join(health.mode.joints)}): lower sim.dt or the gains"
         )
     if weak := [joint for joint in joints if abs(joint.torque) > joint.effort]:
         lines.append(
@@ -167,7 +167,7 @@ def faults(health: RobotNumbers) -> list[str]:
 
 
 def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
-    """Doubtful numbers that some robots train well with, in the same form."""
+    """Doubtful values, in the same form. Some robots train well with them."""
     dt, joints, lines = health.dt, health.joints, []
     if rings := [joint for joint in joints if joint.verdict(dt, health.implicit) == "rings"]:
         lines.append(
@@ -207,8 +207,8 @@ def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
             if gains:
                 health = measure(env.robot, env.robot.pose, env.start_place, control.decimation)
                 wrong, odd = faults(health), doubtful(health, suggest(health.joints, health.moment))
-        except Exception as error:  # a failed check is no fault of the task
-            return [], [f"a few robots on their own could not be looked at: {in_short(error)}"]
+        except Exception as error:  # a failed check is not a fault of the task
+            return [], [f"the task could not be checked: {in_short(error)}"]
     return [*([ends] if ends else []), *wrong], odd
 
 

@@ -25,7 +25,7 @@ from legged_mw.view.stage import FloatArray, ViewError
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
 VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]
-ACROSS, LETTERS = 3, 46  # poses side by side; letters of a line above them
+ACROSS, LETTERS = 3, 46  # poses per row; characters in a text line
 FILL = 0.7  # share of a view's smaller edge for the robot; the names get the rest
 COLLIDER_RGBA, LOOK_ALPHA = (1.0, 0.55, 0.1, 0.42), 0.4
 FOOT_RGBA = (0.0, 0.75, 0.52, 1.0)
@@ -41,7 +41,7 @@ FAMILY_RGB = (
     (0.9, 0.9, 0.9),
 )
 MANY = 16  # number of joints above which the arrows are shorter
-LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; least distance between two names
+LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; smallest distance between two names
 CAPTION = "joint axes: arrows (turn by the right hand)   feet: green   imu: x red, y green, z blue   colliders: orange"
 
 Rgb = tuple[float, float, float]
@@ -53,7 +53,7 @@ class Label(NamedTuple):
     text: str
     place: FloatArray  # (3,) [m, world frame]
     rgb: Rgb
-    # ends (3,) [m, world frame]; drawn over the picture, else the robot would hide them
+    # ends (3,) [m, world frame]; drawn over the picture, because the robot would hide them
     arrows: tuple[tuple[FloatArray, Rgb], ...] = ()
 
 
@@ -128,7 +128,7 @@ class _Picture:
         return halves.mean(axis=(1, 3)).astype(np.uint8)
 
     def _look(self, azimuth: float, elevation: float, smaller: float = 1.0) -> mujoco.MjvCamera:
-        """Make the scene as seen from these angles [deg]. ``smaller``: so much, with room above."""
+        """Make the scene seen from these angles [deg]. ``smaller``: factor on the distance, with space above."""
         camera, model = mujoco.MjvCamera(), self.posed.model
         camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
         half = math.tan(math.radians(model.vis.global_.fovy) / 2)

@@ -203,8 +203,8 @@ def _leg(
         better = signs[leg.knee] * (1.0 if feet == 2 or not _foot_ahead(leg) else -1.0)
         folds = [way * bend for way in (better, -better) if low <= straight + way * bend <= high] or [0.0]
     else:
-        wanted = lengths[inside].min() + STROKE * float(np.ptp(lengths[inside]))
-        folds = [angles[inside][np.abs(lengths[inside] - wanted).argmin()] - straight]
+        target = lengths[inside].min() + STROKE * float(np.ptp(lengths[inside]))
+        folds = [angles[inside][np.abs(lengths[inside] - target).argmin()] - straight]
     return leg._replace(straight=straight, length=float(lengths.max()), folds=tuple(float(fold) for fold in folds))
 
 
@@ -330,15 +330,15 @@ def find_wheels(robot: RobotModel, pose: FloatArray) -> list[str]:
     """The names of joints at the end of a limb that have no range and whose collider is round about the axis."""
     model = robot.physics
     data = posed(model, pose)
-    found = []
+    wheels = []
     for joint in range(1, model.njnt):
         body = int(model.jnt_bodyid[joint])
         first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
         geoms = [geom for geom in range(first, first + count) if model.geom_conaffinity[geom]]
         turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[joint]
         if turns and geoms and body not in model.body_parentid and _is_round(model, data, joint, geoms):
-            found.append(model.joint(joint).name)
-    return found
+            wheels.append(model.joint(joint).name)
+    return wheels
 
 
 def _is_round(model: mujoco.MjModel, data: mujoco.MjData, joint: int, geoms: Sequence[int]) -> bool:

@@ -1,6 +1,6 @@
-"""Triangles of mesh files: read .stl, .obj and .dae, thin them, write .stl.
+"""Triangle meshes: read .stl, .obj and .dae, reduce the number of faces, write .stl.
 
-The files are strangers': their size is bounded, a .dae's entities are refused, and indices are checked.
+The files are not trusted: their size is limited, a DOCTYPE is refused, and indices are checked.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from xml.parsers import expat
 import numpy as np
 
 MOST_BYTES = 128 << 20  # of one mesh file: a binary .stl of 2.6 million triangles
-MOST_FACES = 4_000_000  # likewise, with all copies that a .dae's nodes make
-_MOST_NODES, _DEEPEST = 10_000, 200  # of a .dae, all copies counted; depth of nesting
+MOST_FACES = 4_000_000  # the same for faces, with all copies by a .dae's nodes
+_MOST_NODES, _DEEPEST = 10_000, 200  # of a .dae, including copies; largest depth of nesting
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
 _NO_CORNERS = np.zeros((0, 3, 3))
 
 
 class Triangles(NamedTuple):
-    """A surface."""
+    """A triangle mesh."""
 
     points: np.ndarray  # (V, 3) float
     faces: np.ndarray  # (F, 3) int, indices of points
 
 
 def read_triangles(path: Path) -> Triangles:
-    """The triangles of a .stl, .obj or .dae, in the file's units but for a .dae, which states its unit: then [m].
+    """Read a .stl or .obj in the file's unit, or a .dae in [m], which states its unit.
 
-    Raises ValueError for a file that has none, or that is too large.
+    Raises ValueError for a file without triangles, and for a large file.
     """
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"{path.stat().st_size >> 20} MiB; {MOST_BYTES >> 20} are read at most")
@@ -39,26 +39,26 @@ def read_triangles(path: Path) -> Triangles:
     if path.suffix.lower() not in readers:
         raise ValueError(f"no reader for {path.suffix}")
     try:
-        found = readers[path.suffix.lower()](path)
+        mesh = readers[path.suffix.lower()](path)
     except (IndexError, OverflowError) as error:
         raise ValueError(f"it is no {path.suffix}: {error}") from None
-    if not len(found.faces) or not np.isfinite(found.points).all():
+    if not len(mesh.faces) or not np.isfinite(mesh.points).all():
         raise ValueError("no triangles, or numbers that are not finite")
-    if found.faces.min() < 0 or found.faces.max() >= len(found.points):
-        raise ValueError("a face of a point that is not there")
-    if len(found.faces) > MOST_FACES:
-        raise ValueError(f"{len(found.faces)} triangles; {MOST_FACES} are read at most")
-    return found
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.points):
+        raise ValueError("a face with a missing point")
+    if len(mesh.faces) > MOST_FACES:
+        raise ValueError(f"{len(mesh.faces)} triangles; {MOST_FACES} are read at most")
+    return mesh
 
 
 @lru_cache(maxsize=256)
 def thinned(path: Path, most: int) -> Triangles:
-    """``thin`` of ``read_triangles``, once a process. Raises ValueError."""
+    """``thin`` of ``read_triangles``, cached. Raises ValueError."""
     return thin(read_triangles(path), most)
 
 
 def _merged(corners: np.ndarray) -> Triangles:
-    """``corners`` (F, 3, 3) with equal points made one."""
+    """The mesh of ``corners`` (F, 3, 3), with equal points merged."""
     points, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     return Triangles(points, index.reshape(-1, 3))
 
@@ -96,11 +96,11 @@ def _read_obj(path: Path) -> Triangles:
     return Triangles(np.array(points, float).reshape(-1, 3), np.array(faces, int).reshape(-1, 3))
 
 
-# ---- COLLADA: https://www.khronos.org/files/collada_spec_1_4.pdf, triangles and polygons alone
+# ---- COLLADA: https://www.khronos.org/files/collada_spec_1_4.pdf, only triangles and polygons
 
 
 def _read_dae(path: Path) -> Triangles:
-    """All geometry of the scene, placed by its nodes. The axis that is called up is not turned: RViz does not either."""
+    """All geometries of the scene with the poses of their nodes. The up axis is ignored, as in RViz."""
     root = _parse(path)
     by_id = {element.get("id"): element for element in root.iter() if element.get("id")}
     unit = root.find("asset/unit")
@@ -114,7 +114,7 @@ def _read_dae(path: Path) -> Triangles:
         if count > MOST_FACES:
             raise ValueError(f"more than {MOST_FACES} triangles")
         turned = part @ place[:3, :3].T + place[:3, 3]
-        parts.append(turned[:, ::-1] if np.linalg.det(place[:3, :3]) < 0.0 else turned)  # a mirrored face looks inwards
+        parts.append(turned[:, ::-1] if np.linalg.det(place[:3, :3]) < 0.0 else turned)  # a mirrored face is reversed
     return _merged(scale * np.concatenate(parts))
 
 
@@ -150,7 +150,7 @@ def _parse(path: Path) -> Element:
 
 
 def _placed(scene: Element | None, by_id: dict[str | None, Element]) -> Iterator[tuple[str, np.ndarray]]:
-    """The geometries of a scene by name, each with its place (4, 4)."""
+    """The geometries of a scene, each with its pose (4, 4)."""
     if scene is None:
         return
     waiting, seen = [(node, np.eye(4)) for node in scene.findall("node")], 0
@@ -167,7 +167,7 @@ def _placed(scene: Element | None, by_id: dict[str | None, Element]) -> Iterator
 
 
 def _transform(node: Element) -> np.ndarray:
-    """A node's place (4, 4) in its parent."""
+    """The pose (4, 4) of a node in its parent."""
     place = np.eye(4)
     for step in node:
         if step.tag not in ("matrix", "translate", "scale", "rotate"):
@@ -191,7 +191,7 @@ def _transform(node: Element) -> np.ndarray:
 
 def _corners(geometry: Element, by_id: dict[str | None, Element]) -> np.ndarray:
     """Corners (F, 3, 3) of a geometry's triangles and polygons."""
-    found = [_NO_CORNERS]
+    parts = [_NO_CORNERS]
     for part in geometry.findall("mesh/*"):
         if part.tag not in ("triangles", "polylist", "polygons"):
             continue
@@ -214,13 +214,13 @@ def _corners(geometry: Element, by_id: dict[str | None, Element]) -> np.ndarray:
             triangles = np.array(fans, int).reshape(-1, 3)
         points = _points(of_points, by_id)
         if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(points):
-            raise ValueError("a face of a point that is not there")
-        found.append(points[triangles])
-    return np.concatenate(found)
+            raise ValueError("a face with a missing point")
+        parts.append(points[triangles])
+    return np.concatenate(parts)
 
 
 def _points(vertices: Element, by_id: dict[str | None, Element]) -> np.ndarray:
-    """The points (V, 3) that an input of faces names."""
+    """The points (V, 3) that an input of faces refers to."""
     named = by_id.get(vertices.get("source", "")[1:])
     positions = [] if named is None else [each for each in named.findall("input") if each.get("semantic") == "POSITION"]
     source = by_id.get(positions[0].get("source", "")[1:]) if positions else None
@@ -231,15 +231,15 @@ def _points(vertices: Element, by_id: dict[str | None, Element]) -> np.ndarray:
     return np.array((source.findtext("float_array") or "").split(), float).reshape(-1, max(stride, 1))[:, :3]
 
 
-# ---- fewer triangles
+# ---- reduction
 
 
 def thin(mesh: Triangles, most: int) -> Triangles:
-    """At most ``most`` faces: points within a cell of a grid become their mean (vertex clustering)."""
+    """Reduce to at most ``most`` faces: the points in a cell of a grid become their mean (vertex clustering)."""
     if len(mesh.faces) <= most:
         return mesh
     low, extent = mesh.points.min(axis=0), float(np.ptp(mesh.points, axis=0).max()) or 1.0
-    cells = 2.0 * most**0.5  # along the longest side: a closed surface has about this many squared faces or more
+    cells = 2.0 * most**0.5  # along the longest side; a closed surface has about its square of faces
     while True:
         places = np.floor((mesh.points - low) * (cells / extent)).astype(int)
         _, index, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)

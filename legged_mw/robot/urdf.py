@@ -1,4 +1,4 @@
-"""Prepare a URDF for MuJoCo's reader: find mesh files, drop unreadable visuals, keep links without mass massless."""
+"""Prepare a URDF for MuJoCo's reader: find mesh files, drop unreadable visuals, remove tiny masses."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def read_urdf(source: XmlSource, notes: list[str], lost: dict[str, str]) -> tupl
     """
     file, robot = source.file, source.root
     if any(element.tag.startswith("xacro:") for element in robot.iter()):
-        raise ModelError(f"{file.name} holds xacro macros; write them out first: xacro {file.name} > robot.urdf")
+        raise ModelError(f"{file.name} has xacro macros; expand them first: xacro {file.name} > robot.urdf")
     for other in [child for child in robot if child.tag not in _KNOWN]:
         robot.remove(other)
     _drop_places(robot, notes)
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
     if mimics := [name for name, joint in joints.items() if joint.find("mimic") is not None]:
-        notes.append(f"mimic dropped: {', '.join(mimics)} move by themselves")
+        notes.append(f"mimic dropped: {', '.join(mimics)} are independent joints")
     _drop_points(robot, file, notes)
     _keep_one_material(robot, notes)
     _drop_specks(robot, notes)
@@ -53,7 +53,7 @@ def read_urdf(source: XmlSource, notes: list[str], lost: dict[str, str]) -> tupl
 
 
 def _drop_places(robot: Element, notes: list[str]) -> None:
-    """Drop root links that only place the robot for other programs, one after another."""
+    """Drop root links, such as base_footprint, that only define a frame for other programs."""
     children = {_end(joint, "child") for joint in robot.findall("joint")}
     for link in [link for link in robot.findall("link") if link.get("name") not in children]:
         held = [joint for joint in robot.findall("joint") if _end(joint, "parent") == link.get("name")]
@@ -71,7 +71,7 @@ def _end(joint: Element, which: str) -> str | None:
 
 
 def _leads_elsewhere(joint: Element) -> bool:
-    """Whether the joint moves the robot away from an empty link above it, such as base_footprint on the ground."""
+    """Whether the joint offsets or frees the robot from an empty parent link, such as base_footprint."""
     origin = joint.find("origin")
     numbers = [] if origin is None else f"{origin.get('xyz', '')} {origin.get('rpy', '')}".split()
     return joint.get("type") == "floating" or (
@@ -95,7 +95,7 @@ def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
 
 
 def _keep_one_material(robot: Element, notes: list[str]) -> None:
-    """Keep the first material of each look: MuJoCo refuses a second one, which B2's exporter writes."""
+    """Keep the first material of each visual: MuJoCo refuses a second one, which B2's exporter writes."""
     with_more = [part for part in robot.iter("visual") if len(part.findall("material")) > 1]
     for part in with_more:
         for other in part.findall("material")[1:]:
@@ -105,7 +105,7 @@ def _keep_one_material(robot: Element, notes: list[str]) -> None:
 
 
 def _drop_specks(robot: Element, notes: list[str]) -> None:
-    """Drop masses that an exporter writes for a link of no size, 4e-15 kg in B2's: MuJoCo takes no moment below 1e-15."""
+    """Drop masses of empty links, such as B2's exporter writes (4e-15 kg): MuJoCo refuses moments below 1e-15."""
     specks: list[str] = []
     for link in robot.findall("link"):
         inertial, mass = link.find("inertial"), link.find("inertial/mass")
@@ -137,18 +137,18 @@ def _find_meshes(robot: Element, file: Path, notes: list[str], lost: dict[str, s
             mesh = part.find("geometry/mesh")
             if mesh is None:
                 continue
-            asked = mesh.get("filename", "")
-            path = _resolve(asked, file, meshdir)
+            filename = mesh.get("filename", "")
+            path = _resolve(filename, file, meshdir)
             reason = why_unreadable(path)
             if reason and part.tag == "collision":
                 name = link.get("name", "")
                 lost[name] = (
-                    f"{file.name}: link '{name}' collides as the mesh {asked}, which cannot be read ({reason}; looked for it "
+                    f"{file.name}: link '{name}' collides as the mesh {filename}, which cannot be read ({reason}; looked for it "
                     f"beside {file.name} and in the folders above); put it there as one of {', '.join(READABLE)}, or {SHAPES}"
                 )
-                notes.append(f"collider of '{name}' left out ({reason}): {asked}")
+                notes.append(f"collider of '{name}' left out ({reason}): {filename}")
             elif reason:
-                left_out.setdefault(reason, []).append(asked)
+                left_out.setdefault(reason, []).append(filename)
             if reason:
                 link.remove(part)
                 continue
@@ -159,7 +159,7 @@ def _find_meshes(robot: Element, file: Path, notes: list[str], lost: dict[str, s
 
 
 def _resolve(asked: str, file: Path, meshdir: str) -> Path:
-    """The path of a mesh in a URDF. package:// is the folder of that name above the URDF, else any folder above it."""
+    """The path of a mesh in a URDF. package:// is searched in the folders above it, by the package's name first."""
     here = file.resolve().parent
     scheme, _, rest = asked.rpartition("://")
     if scheme == "file":
@@ -170,13 +170,13 @@ def _resolve(asked: str, file: Path, meshdir: str) -> Path:
     places = [folder / inside for folder in above if folder.name == package] + [
         folder / package / inside for folder in above
     ]
-    # the package may lie in a folder of another name
+    # the folder of the package may have another name
     places += [folder / inside for folder in above[:5]] + [here / meshdir / inside, here / name, here / "meshes" / name]
     return next((place for place in places if place.is_file()), here / inside)
 
 
 def _set_looks(spec: mujoco.MjSpec) -> None:
-    """Hide colliders of links with visuals. Give links without <inertial> no mass."""
+    """Hide colliders of links with visuals. Links without <inertial> get no mass."""
     for body in spec.bodies:
         seen = any(not (geom.contype or geom.conaffinity) for geom in body.geoms)
         for geom in body.geoms:

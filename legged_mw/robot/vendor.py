@@ -148,8 +148,8 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
 
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
     """Drop sensors whose values the state contains. Contact sensors and ``wanted`` sensors stay."""
-    kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS.split()}
-    if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept and sensor.name not in wanted]:
+    kept_types = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS.split()}
+    if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept_types and sensor.name not in wanted]:
         notes.append(
             f"sensors dropped, as nothing reads them: {', '.join(sensor.name or 'one without a name' for sensor in dropped)}"
         )

@@ -1,1 +1,1 @@
-"""The simulator seam: takes numbers and names, hands out torch tensors; does not know what they are for."""
+"""The interface to the simulator. It has numbers, names and torch tensors, and no knowledge of tasks."""

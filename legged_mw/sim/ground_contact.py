@@ -1,4 +1,4 @@
-"""Warp kernels for a height field: its heights, and its contacts, which mujoco-warp's contact filter makes.
+"""Warp kernels for a height field: its heights, and its contacts, which replace mujoco-warp's in its contact filter.
 
 mujoco-warp 4.0.0 treats a height field as many prisms. A sphere gets a contact from every near triangle, tilted ones at
 edges inside a plane, and sometimes a false deep contact (figures in docs/terrain.md). Here a sphere has a contact at

@@ -86,11 +86,11 @@ def read_plain(file: Path) -> RobotFile | None:
             notes.append(f"keyframe '{key.name}' read: pose and height of the root, where nothing else states them")
             spec.delete(key)
         spec.nkey = 0
-        with warnings.catch_warnings(record=True) as said:
+        with warnings.catch_warnings(record=True) as caught:
             model = compile_copy(spec)
     except (OSError, ValueError, ParseError, RecursionError):
         return None
-    if said or not model.body_mass.sum() <= _LARGEST:
+    if caught or not model.body_mass.sum() <= _LARGEST:
         return None
     return RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
 

@@ -96,8 +96,8 @@ def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[
     area = np.where(np.abs(bu * cv - bv * cu) > 1e-12, bu * cv - bv * cu, np.inf)
     u, v = lines[:, :1] - au, lines[:, 1:] - av
     share_b, share_c = (u * cv - v * cu) / area, (v * bu - u * bv) / area
-    met = (share_b >= 0.0) & (share_c >= 0.0) & (share_b + share_c <= 1.0) & np.isfinite(area)
-    return (a + share_b[..., None] * ab + share_c[..., None] * ac)[met]
+    inside = (share_b >= 0.0) & (share_c >= 0.0) & (share_b + share_c <= 1.0) & np.isfinite(area)
+    return (a + share_b[..., None] * ab + share_c[..., None] * ac)[inside]
 
 
 def _spaced(half: float, spacing: float) -> list[float]:

@@ -19,38 +19,38 @@ BLOCK = (0.05, 0.25)  # [m] of blocks and holes [legged_gym]
 STONE_GAP = (0.05, 0.2)  # [m] between stones [legged_gym: 0.05, 0.1]
 DITCH = (0.05, 0.6)  # [m] of width [legged_gym: 0 to 1]
 SLOPE, WAVE, NOISE = 0.4, 0.3, 0.05  # at difficulty 1: [-], then [m]; a wave from trough to crest
-MOST_HEIGHTS = 1e8  # of a whole ground: 0.8 GB on the host, half of it on the device
+MOST_HEIGHTS = 1e8  # largest number of heights: 0.8 GB on the host, half of it on the device
 # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
 PLATFORM = 1.0
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """A height field of tiles, ``levels`` along x and ``len(kinds)`` along y, inside a flat border.
+    """A height field of tiles inside a flat border: ``levels`` along x, ``len(kinds)`` along y.
 
-    Each cell is two triangles, cut along the diagonal from (row, column) to (row + 1, column + 1), as in MuJoCo.
+    Each cell is two triangles, divided by the diagonal from (row, column) to (row + 1, column + 1), as in MuJoCo.
     """
 
     heights: Heights  # (R, C) [m], row = +y, column = +x, vertices at the rim included
     cell: float  # [m] between two vertices
     corner: tuple[float, float]  # x, y of the vertex (0, 0) [m, world]
     tile: float  # [m] edge of a tile
-    kinds: tuple[str, ...]  # of each column of tiles
-    difficulties: tuple[float, ...]  # of each level
-    origins: NDArray[np.float64]  # (levels, kinds, 3) the middle of each tile, on the ground [m, world]
+    kinds: tuple[str, ...]  # kind of each column of tiles
+    difficulties: tuple[float, ...]  # difficulty of each level
+    origins: NDArray[np.float64]  # (levels, kinds, 3) centre of each tile, on the ground [m, world]
 
     @property
     def levels(self) -> int:
         return len(self.origins)
 
     def tile_at(self, x: float, y: float) -> tuple[int, int] | None:
-        """Level and column of the tile at x, y [m, world]; None outside of all tiles."""
+        """Level and column of the tile at x, y [m, world]; None outside the tiles."""
         level = int(np.floor(x / self.tile + self.levels / 2))
         column = int(np.floor(y / self.tile + len(self.kinds) / 2))
         return (level, column) if 0 <= level < self.levels and 0 <= column < len(self.kinds) else None
 
     def vertices(self, level: int, column: int) -> tuple[slice, slice]:
-        """Rows and columns of ``heights`` in a tile, with its rim."""
+        """Rows and columns of ``heights`` in a tile, including its rim."""
         n = round(self.tile / self.cell)
         edge = (self.heights.shape[1] - 1 - self.levels * n) // 2
         y, x = edge + column * n, edge + level * n
@@ -66,13 +66,13 @@ def make_terrain(
     levels: int,
     proportions: Mapping[str, float],  # kind -> share of the columns
     columns: int,
-    difficulty: tuple[float, float] = (0.0, 1.0),  # of the first and the last level
+    difficulty: tuple[float, float] = (0.0, 1.0),  # of the first level and of the last level
     tile: float,
     cell: float,
     border: float,
     seed: int,
 ) -> Terrain:
-    """Build all tiles; difficulty rises evenly from level to level. Raises ModelError for arguments that do not fit."""
+    """Build all tiles. The difficulty rises linearly with the level. Raises ModelError for invalid arguments."""
     for kind in proportions:
         if kind not in KINDS:
             raise ModelError.of(("proportions", unknown("kind of terrain", kind, KINDS, "the table of kinds")))
@@ -105,7 +105,7 @@ def make_terrain(
 
 
 def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
-    """The heights that the function of ``kind`` returned. Raises ModelError if they are no tile."""
+    """The heights from the function of ``kind``. Raises ModelError if they are not a valid tile."""
     patch, shape, name = np.asarray(patch, dtype=float), grid.zeros().shape, f"kind of terrain '{kind}'"
     if patch.shape != shape:
         raise ModelError(f"{name} returned heights of shape {patch.shape}; a tile has {shape}, as grid.zeros()")
@@ -120,25 +120,25 @@ def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
 
 
 def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, ...]:
-    """A kind for each column, in the order given: shares rounded to whole columns, each kind at least once."""
-    wanted = {kind: share for kind, share in proportions.items() if share > 0}
-    if not wanted:
+    """A kind for each column, in the given order. Shares are rounded to whole columns, at least one per kind."""
+    shares = {kind: share for kind, share in proportions.items() if share > 0}
+    if not shares:
         none = f"no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}"
         raise ModelError.of(("proportions", none))
-    if len(wanted) > columns:
-        few = f"{columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one"
+    if len(shares) > columns:
+        few = f"{columns} columns cannot hold {len(shares)} kinds; every kind with a share above 0 needs one"
         raise ModelError.of(("columns", few))
-    bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
-    places = np.searchsorted(bounds, (np.arange(columns) + 0.5) / columns).clip(max=len(wanted) - 1)
-    kinds = [list(wanted)[place] for place in places]
-    for kind in wanted:
+    bounds = np.cumsum(list(shares.values())) / sum(shares.values())
+    places = np.searchsorted(bounds, (np.arange(columns) + 0.5) / columns).clip(max=len(shares) - 1)
+    kinds = [list(shares)[place] for place in places]
+    for kind in shares:
         if kind not in kinds:
-            most = max(wanted, key=kinds.count)
+            most = max(shares, key=kinds.count)
             kinds[len(kinds) - 1 - kinds[::-1].index(most)] = kind
-    return tuple(sorted(kinds, key=list(wanted).index))
+    return tuple(sorted(kinds, key=list(shares).index))
 
 
-# ---- kinds of ground: (n + 1, n + 1) heights, flat in the middle and zero along the rim, so that tiles fit together
+# ---- kinds of ground: (n + 1, n + 1) heights, flat at the centre and zero at the rim, so that tiles fit together
 
 
 @dataclass(frozen=True)
@@ -147,24 +147,24 @@ class Grid:
 
     n: int  # cells along an edge
     cell: float  # [m] between two vertices
-    pit: bool  # every second tile along both axes: kinds that go up or down make a pit
+    pit: bool  # true for every second tile along both axes: kinds that go up or down then make a pit
 
     @property
     def distance(self) -> Heights:
-        """Distance from the middle, the larger of |x| and |y| [m]."""
+        """Distance from the centre [m]: the larger of |x| and |y|."""
         along = np.abs(np.arange(self.n + 1) - self.n / 2) * self.cell
         return np.maximum(along[:, None], along[None, :])
 
     @property
     def half(self) -> float:
-        """Half the edge [m], the largest distance."""
+        """Half of the edge [m], which is the largest distance."""
         return 0.5 * self.n * self.cell
 
     def zeros(self) -> Heights:
         return np.zeros((self.n + 1, self.n + 1))
 
     def fade(self, heights: Heights) -> Heights:
-        """Scale ``heights`` to 0 in the middle and, over the last 0.5 m, along the rim."""
+        """Scale ``heights`` to 0 at the centre, and at the rim over the last 0.5 m."""
         inside = np.clip((self.distance - PLATFORM) / 0.3, 0.0, 1.0)
         outside = np.clip((self.half - self.distance) / 0.5, 0.0, 1.0)
         return heights * inside * outside
@@ -174,13 +174,13 @@ class Grid:
 Kind = Callable[[Grid, float, np.random.Generator], Heights]
 
 KINDS: dict[str, Kind] = {}
-# kind -> its measure of difficulty "name [unit]", and the values of that at difficulty 0 and 1
+# kind -> its measure of difficulty "name [unit]", and its values at difficulty 0 and 1
 MEASURES: dict[str, tuple[str, float, float]] = {}
 LEVEL: set[str] = set()  # kinds made of level pieces
 
 
 def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: bool = False) -> Callable[[Kind], Kind]:
-    """Make the decorated function a kind of ground under its own name.
+    """Register the decorated function as a kind of ground with its own name.
 
     ``measure``: its measure of difficulty, such as "depth [cm]"; ``low`` and ``high``: values at difficulty 0 and 1.
     ``level``: it consists of level pieces, such as steps; MuJoCo's own engine and exports make boxes of them.
@@ -209,32 +209,32 @@ def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: b
 
 @add_kind(level=True)
 def flat(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Nothing."""
+    """Level ground."""
     return grid.zeros()
 
 
 @add_kind("slope [%]", 0.0, 100 * SLOPE)
 def smooth_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym; ours: in turn, not by chance]."""
+    """A pyramid or, every second time, a pit, with a slope of up to 0.4 [legged_gym; ours: alternating, not random]."""
     rise = SLOPE * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
     return -rise if grid.pit else rise
 
 
 @add_kind("slope [%]", 0.0, 100 * SLOPE)
 def rough_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """The same with 5 cm of noise on it [legged_gym]."""
+    """The same, with 5 cm of noise [legged_gym]."""
     return smooth_slope(grid, difficulty, rng) + grid.fade(_noise(grid, 0.05, 0.2, rng))
 
 
 @add_kind("step [cm]", 100 * STEP[0], 100 * STEP[1], level=True)
 def stairs_up(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep."""
+    """Stairs from a pit at the centre up to the rim. Steps are 6 to 19.5 cm high and 30 cm deep."""
     return -_stairs(grid, _between(STEP, difficulty))
 
 
 @add_kind("step [cm]", 100 * STEP[0], 100 * STEP[1], level=True)
 def stairs_down(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """From the top in the middle down to the rim."""
+    """Stairs from the top at the centre down to the rim."""
     return _stairs(grid, _between(STEP, difficulty))
 
 
@@ -262,7 +262,7 @@ def waves(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
 
 @add_kind("gap [cm]", 100 * STONE_GAP[0], 100 * STONE_GAP[1], level=True)
 def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Square stones of 1.5 m down to 0.3 m, with gaps of 5 to 20 cm, 0.3 m deep [legged_gym; ours: less deep]."""
+    """Square stones of 1.5 m to 0.3 m, with gaps of 5 to 20 cm, 0.3 m deep [legged_gym; ours: less deep]."""
     stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
     gap = max(round(_between(STONE_GAP, difficulty) / grid.cell), 1)
     heights = np.full((grid.n + 1, grid.n + 1), -0.3)
@@ -279,7 +279,7 @@ def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> 
 
 @add_kind("width [cm]", 100 * DITCH[0], 100 * DITCH[1], level=True)
 def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """A ditch around the middle, 5 to 60 cm wide, 0.5 m deep [legged_gym; ours: less wide]."""
+    """A ditch around the centre, 5 to 60 cm wide, 0.5 m deep [legged_gym; ours: less wide]."""
     width = min(max(_between(DITCH, difficulty), grid.cell), grid.half - PLATFORM - grid.cell)
     heights = grid.zeros()
     heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
@@ -293,7 +293,7 @@ def low_random(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heigh
 
 
 def name_tile(kind: str, difficulty: float) -> str:
-    """A kind with its measure of difficulty: "stairs_up, step 12.8 cm"."""
+    """A kind with the value of its measure of difficulty: "stairs_up, step 12.8 cm"."""
     if kind not in MEASURES:
         return kind
     name, value, unit = measure(kind, difficulty)
@@ -312,14 +312,14 @@ def _between(span: tuple[float, float], difficulty: float) -> float:
 
 
 def _stairs(grid: Grid, height: float, width: float = 0.3) -> Heights:
-    """A pyramid of steps: from the rim inwards one step every ``width`` [m], up to the middle."""
+    """A pyramid of steps: one step every ``width`` [m], from the rim to the centre."""
     count = int((grid.half - 0.5 - PLATFORM) / width + 1e-6)
     step = np.ceil((grid.half - 0.5 - grid.distance) / width - 1e-6)
     return height * np.clip(step, 0, count)
 
 
 def _noise(grid: Grid, height: float, every: float, rng: np.random.Generator) -> Heights:
-    """Uniform draws within +-``height`` at every ``every`` [m], interpolated between."""
+    """Uniform noise within +-``height`` every ``every`` [m], with interpolation."""
     coarse = np.arange(0.0, 2.0 * grid.half + every, every)
     fine = np.arange(grid.n + 1) * grid.cell
     draws = rng.uniform(-height, height, (len(coarse), len(coarse)))

@@ -1,1 +1,1 @@
-"""Robots that get up, stand on two legs or follow a motion: siblings of walking. The core imports none of them."""
+"""Tasks other than walking: getting up, handstands and motion tracking. The core imports none of them."""

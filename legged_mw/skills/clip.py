@@ -1,4 +1,4 @@
-"""A reference motion: root and joints over time, its file, and its velocities. Numbers only: no simulator, no torch.
+"""A reference motion: root and joints over time, its file, and its velocities. It uses no simulator and no torch.
 
 Quaternions are (w, x, y, z), unit, body to world.
 """
@@ -16,12 +16,12 @@ from legged_mw.utils.errors import UserError, unknown
 from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[np.float64]
-LARGEST = 1e4  # [m] or [rad], the largest place or angle in a clip
-KEYS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")  # of a clip's .npz
+LARGEST = 1e4  # [m] or [rad], largest position or angle in a clip
+KEYS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")  # arrays of a clip's .npz
 
 
 class ClipError(UserError, ValueError):
-    """A clip that cannot be used; the text says why and what to do."""
+    """A clip that cannot be used. The text gives the reason and the remedy."""
 
 
 class Clip(NamedTuple):
@@ -35,23 +35,23 @@ class Clip(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """From the first frame to the last [s]."""
+        """[s] from the first frame to the last."""
         return (len(self.root_pos) - 1) / self.fps
 
     def qpos(self) -> Floats:
-        """(T, 7 + D), as MuJoCo has it."""
+        """(T, 7 + D) states in MuJoCo's order."""
         return np.concatenate([self.root_pos, self.root_quat, self.joint_pos], axis=1)
 
     def qvel(self) -> Floats:
         """(T, 6 + D) root [m/s, world], angular velocity [rad/s, body], joints [rad/s], by central differences."""
-        # from frame to frame
+        # between neighbouring frames
         turn = rotation_vector(multiply(conjugate(self.root_quat[:-1]), self.root_quat[1:])) * self.fps
         turning = np.concatenate([turn[:1], (turn[:-1] + turn[1:]) / 2, turn[-1:]])
         root, joints = (np.gradient(values, 1.0 / self.fps, axis=0) for values in (self.root_pos, self.joint_pos))
         return np.concatenate([root, turning, joints], axis=1)
 
     def at(self, rate: float) -> Clip:
-        """The same motion with ``rate`` frames a second, interpolated linearly and along great circles."""
+        """The motion at ``rate`` frames per second: linear interpolation, and slerp for the quaternions."""
         if abs(rate - self.fps) < 1e-6:
             return self
         if not self.seconds * rate + 1e-6 >= 1:
@@ -67,7 +67,7 @@ class Clip(NamedTuple):
         return Clip(rate, self.joint_names, root, turned, joints)
 
     def of(self, joints: Sequence[str], where: str) -> Clip:
-        """The same motion of these ``joints`` alone, in their order. Raises ClipError for one that the clip lacks."""
+        """The motion of ``joints`` only, in their order. Raises ClipError for a joint that the clip lacks."""
         for name in joints:
             if name not in self.joint_names:
                 raise ClipError(f"{where}: {unknown('joint', name, self.joint_names, 'the clip')}")
@@ -76,7 +76,7 @@ class Clip(NamedTuple):
 
 
 def read_clip(path: Path) -> Clip:
-    """The clip in an .npz as ``save_clip`` writes it. Raises ClipError."""
+    """Read the clip in an .npz of ``save_clip``. Raises ClipError."""
     try:
         held = read_arrays(path)
     except ValueError as error:
@@ -85,7 +85,7 @@ def read_clip(path: Path) -> Clip:
 
 
 def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
-    """The clip of the arrays ``held`` of the file ``path``. Raises ClipError."""
+    """The clip with the arrays ``held`` of the file ``path``. Raises ClipError."""
     if missing := [key for key in KEYS if key not in held]:
         hint = f"convert it with: python -m legged_mw.motion {path.name} --task TASK --out CLIP.npz"
         raise ClipError(f"{path} is no clip of legged_mw, for it has no '{missing[0]}'; {hint}")
@@ -93,8 +93,8 @@ def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
     for key, array in arrays.items():
         kinds, axes = ("US" if key == "joint_names" else "fiu"), {"fps": 0, "joint_names": 1}.get(key, 2)
         if array.dtype.kind not in kinds or array.ndim != axes:
-            wanted = f"{'text' if kinds == 'US' else 'numbers'} along {axes} axes"
-            raise ClipError(f"{path}: {key} is {array.dtype} along {array.ndim} axes; it must be {wanted}")
+            expected = f"{'text' if kinds == 'US' else 'numbers'} along {axes} axes"
+            raise ClipError(f"{path}: {key} is {array.dtype} along {array.ndim} axes; it must be {expected}")
     names = tuple(map(str, arrays["joint_names"]))
     return checked(path, float(arrays["fps"]), names, *(arrays[key] for key in KEYS[2:]))
 
@@ -102,13 +102,13 @@ def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
 def checked(
     path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, root_quat: ArrayLike, joint_pos: ArrayLike
 ) -> Clip:
-    """A clip of these arrays, with unit quaternions that do not jump in sign. Raises ClipError."""
+    """A clip with these arrays, with unit quaternions without sign jumps. Raises ClipError."""
     pos, quat, joints = (np.array(values, dtype=np.float64) for values in (root_pos, root_quat, joint_pos))
     frames = len(pos)
     if frames < 2 or (pos.shape, quat.shape, joints.shape) != ((frames, 3), (frames, 4), (frames, len(names))):
-        found = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape} for {len(names)} joints"
-        wanted = f"there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
-        raise ClipError(f"{path}: {found}; {wanted}")
+        actual = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape} for {len(names)} joints"
+        expected = f"there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
+        raise ClipError(f"{path}: {actual}; {expected}")
     length = np.linalg.norm(quat, axis=1, keepdims=True)
     finite = all(np.isfinite(values).all() for values in (pos, quat, joints))
     if not finite or not fps > 0 or (np.abs(length - 1.0) > 0.01).any():
@@ -124,7 +124,7 @@ def checked(
 
 
 def save_clip(path: Path, clip: Clip) -> None:
-    """Write ``path`` (.npz), float32."""
+    """Write the clip to ``path`` (.npz) as float32."""
     arrays = {key: np.asarray(getattr(clip, key), dtype=np.float32) for key in KEYS if key != "joint_names"}
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, joint_names=np.array(clip.joint_names), **arrays)  # type: ignore[arg-type]
@@ -134,7 +134,7 @@ def save_clip(path: Path, clip: Clip) -> None:
 
 
 def multiply(a: Floats, b: Floats) -> Floats:
-    """Quaternions (..., 4): first ``b``, then ``a``."""
+    """The product of quaternions (..., 4): rotation ``b``, then ``a``."""
     w, u, s, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     return np.concatenate([w * s - (u * v).sum(axis=-1, keepdims=True), w * v + s * u + np.cross(u, v)], axis=-1)
 
@@ -145,21 +145,21 @@ def conjugate(q: Floats) -> Floats:
 
 
 def rotate(q: Floats, v: Floats) -> Floats:
-    """Vectors (..., 3) turned by ``q`` (..., 4)."""
+    """Rotate vectors (..., 3) by ``q`` (..., 4)."""
     u = q[..., 1:]
     t = 2.0 * np.cross(u, v)
     return v + q[..., :1] * t + np.cross(u, t)
 
 
 def heading(q: Floats) -> Floats:
-    """The part of a rotation about the vertical (..., 4)."""
+    """The rotation about the vertical in ``q``, (..., 4)."""
     w, x, y, z = np.moveaxis(q, -1, 0)
     half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
     return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
 
 
 def rotation_vector(q: Floats) -> Floats:
-    """Axis times angle (..., 3) [rad], the shorter way."""
+    """Axis times angle (..., 3) [rad], with an angle up to pi."""
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     return q[..., 1:] * np.where(sine > 1e-9, 2 * np.arctan2(sine, q[..., :1]) / np.maximum(sine, 1e-9), 2.0)

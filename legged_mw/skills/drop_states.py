@@ -1,4 +1,4 @@
-"""States of a robot after it was dropped with its motors off, by MuJoCo's own engine on the host.
+"""States of a robot after a drop with its motors off, simulated with MuJoCo's own engine on the host.
 
 The same seed gives the same states on any machine, with any number of threads, for any engine.
 """
@@ -13,16 +13,16 @@ from mujoco.batch import Batch
 
 from legged_mw.utils.machine import usable_cores
 
-DAMPING = (0.0, 5.0)  # [N m s/rad] at least, of the joints: half of the states limp, half as with braking motors
-VELOCITY = 0.5  # [m/s, rad/s] of the root when it is dropped: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
-CLEAR = 0.02  # [m] between the lowest point and the ground when it is dropped
-_CHUNK = 256  # worlds stepped together, to bound memory
+DAMPING = (0.0, 5.0)  # [N m s/rad] least joint damping: half of the states limp, half braked
+VELOCITY = 0.5  # [m/s, rad/s] root velocity at the drop: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
+CLEAR = 0.02  # [m] between the lowest point and the ground at the drop
+_CHUNK = 256  # worlds stepped together; it limits the memory
 
 
 def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """qpos (count, nq) and qvel (count, nv), ``seconds`` after a drop in any attitude with any joint angles.
+    """qpos (count, nq) and qvel (count, nv), ``seconds`` after a drop with random attitude and joint angles.
 
-    ``model`` has a free joint, then hinges, and its ground is z = 0. A smaller ``count`` gives the first of the states.
+    ``model`` has a free joint, then hinges, and the ground z = 0. A smaller ``count`` gives the first of these states.
     """
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -30,7 +30,7 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
     model.opt.iterations, model.opt.ls_iterations = 50, 50
     starts = _drops(model, count, np.random.default_rng(seed))
     batch = Batch(model, min(_CHUNK, -(-count // 2)), usable_cores())
-    found = [np.empty((count, size)) for size in (model.nq, model.nv)]
+    result = [np.empty((count, size)) for size in (model.nq, model.nv)]
     for half, damping in enumerate(DAMPING):  # every other state
         batch.expand("dof_damping")[:, 6:] = np.maximum(model.dof_damping[6:], damping)
         for first in range(half, count, 2 * len(batch.state)):
@@ -39,13 +39,13 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
             for name, start in zip(("qpos", "qvel"), starts, strict=True):
                 batch.bind(name)[: len(which)] = start[which]
             batch.step(nstep=round(seconds / model.opt.timestep))
-            for name, states in zip(("qpos", "qvel"), found, strict=True):
+            for name, states in zip(("qpos", "qvel"), result, strict=True):
                 states[which] = batch.bind(name)[: len(which)]
-    return found[0], found[1]
+    return result[0], result[1]
 
 
 def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Any attitude, any joint angles within the ranges (+-pi without one), just above the ground."""
+    """Random attitudes, and joint angles within the ranges (+-pi without a range), just above the ground."""
     data, joints = mujoco.MjData(model), slice(1, model.njnt)
     draw = rng.random((count, 9 + model.nq - 7))  # all at once, so that a state does not depend on ``count``
     # [Shoemake 1992: uniform attitudes]

@@ -1,4 +1,4 @@
-"""Get up from any fall, and stay standing in the default pose. Episodes begin in falls; a force helps robots learn.
+"""Get up after any fall and stay in the default pose. Episodes begin after a fall. A force helps robots learn.
 
 Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobotLab), a G1; [ours] with the reason.
 """
@@ -24,19 +24,19 @@ Settling = Annotated[float, above(0, 60, "s")]
 
 # a robot is up above this cosine of the tilt (15 degrees) and share of standing height [ours: servos alone hold 0.92]
 UP_TILT, UP_HEIGHT = 0.966, 0.9
-# the lift's level rises by an episode that ends down so many times as much as it falls by one that ends up [ours]
+# factor: an episode that ends down raises the level by this times the decrease of one that ends up [ours]
 GIVEN_BACK = 3.0
 
 
 class GetupCfg(SkillCfg):
     class falls:
-        share: Share = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
-        states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
+        share: Share = 0.75  # share of episodes that begin after a fall; the others begin standing [P 0.6]
+        states: Count = 2048  # number of states after falls; at most four per world are made [ours]
         seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
-        seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has its own
-        pull: Share = 0.0  # lifting force, as a share of the weight; it fades as robots learn [H 0.6]
-        pull_on: str = ""  # body that it lifts; empty: the root (a robot with a heavy trunk then hangs head down)
-        pull_fades: PositiveShare = 0.2  # share by which it falls when every world has ended an episode up [ours]
+        seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has another
+        pull: Share = 0.0  # lifting force, as a share of the weight; it decreases as robots learn [H 0.6]
+        pull_on: str = ""  # lifted body; empty: the root (a robot with a heavy trunk then hangs head down)
+        pull_fades: PositiveShare = 0.2  # decrease of the force when every world has ended an episode up [ours]
 
     class env(SkillCfg.env):
         episode_length_s = 6.0  # [s] [P]
@@ -81,15 +81,15 @@ class GetupCfgPPO(SkillCfgPPO):
 
 
 class LiftAssist:
-    """A force against gravity on a body of each robot: ``level`` (), from 1 to 0, times ``force`` [N].
+    """A force against gravity on one body of each robot: ``level`` () from 1 to 0, times ``force`` [N].
 
-    Robots that already stand are lifted too. Otherwise they learn to lean on the force and it never fades.
+    It also lifts robots that stand. Otherwise they learn to rely on the force, and the level never decreases.
     """
 
     written = ("level",)
 
     def __init__(self, sim: Simulation, body: int, gravity_dir: Tensor, force: float, fades: float) -> None:
-        """``gravity_dir`` (N, 3), world frame, leans on a drawn slope. ``fades`` is ``falls.pull_fades``."""
+        """``gravity_dir`` (N, 3), world frame, is tilted on a slope. ``fades`` is ``falls.pull_fades``."""
         self._force, self._down, self._fades = sim.xfrc_applied[:, body, :3], gravity_dir, fades  # a view (N, 3)
         self._highest, self.level = force, torch.ones((), device=sim.device)
 
@@ -99,13 +99,13 @@ class LiftAssist:
             torch.mul(self._down, -self._highest * self.level, out=self._force)
 
     def update(self, ended: Tensor, up: Tensor) -> None:
-        """Lower the level by the worlds that ``ended`` (N,) an episode ``up`` (N,), raise it by those that did not."""
+        """Lower the level for worlds that ``ended`` (N,) an episode ``up`` (N,); raise it for the others that ended."""
         if self._highest:
             change = torch.where(up, -1.0, GIVEN_BACK).masked_fill(~ended, 0.0).mean()
             self.level.add_(change, alpha=self._fades).clamp_(0.0, 1.0)
 
     def statistics(self) -> dict[str, Tensor]:
-        """The level, a sum and what to divide it by."""
+        """The level, as sum and count."""
         return {"pull": torch.stack([self.level, torch.ones_like(self.level)])} if self._highest else {}
 
 
@@ -118,14 +118,14 @@ class Getup(RobotTask):
         falls = self.cfg.falls
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
-        self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
+        self.up_height = 0.99 * self.start_place[2]  # [m] height of a standing root [P: 0.275 of 0.278]
         self.upright = self.buffer()  # (N,) cosine of the tilt
-        self.up = self.buffer(dtype=torch.bool)  # (N,) as high and upright as a standing robot
+        self.up = self.buffer(dtype=torch.bool)  # (N,) true if the robot is as high and upright as a standing one
         force = falls.pull * 9.81 * self.total_mass
         self.pull = self.remember(LiftAssist(self.sim, self._lifted(), self.gravity_dir, force, falls.pull_fades))
 
     def _lifted(self) -> int:
-        """The body that ``falls.pull`` lifts."""
+        """The index of the body that ``falls.pull`` lifts."""
         falls, model = self.cfg.falls, self.robot.physics
         names = [model.body(i).name for i in range(1, model.nbody)]
         if falls.pull_on and falls.pull_on not in names:
@@ -137,7 +137,7 @@ class Getup(RobotTask):
         return lifted
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Standing, or with probability ``falls.share`` in one of the settled falls."""
+        """Start in the default pose, or with probability ``falls.share`` in a state after a fall."""
         super()._reset_robots(mask)
         fall = mask & (torch.rand_like(self.rew_buf) < self.cfg.falls.share)
         pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)

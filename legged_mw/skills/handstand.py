@@ -1,4 +1,4 @@
-"""Handstand and footstand: from standing on all legs to two of them, and staying there. Task, config, learner's config.
+"""Handstand and footstand: rise from four legs to two and stay. It has the task, its config and the learner's config.
 
 Source [P]: MuJoCo Playground's Go1 handstand and footstand (commit d5e6b47); [ours] with the reason. The paper
 penalises ground contacts of the legs in the air, Playground's code since a047305 those of any foot. Here it is as in
@@ -22,7 +22,7 @@ class HandstandCfg(SkillCfg):
         episode_length_s = 10.0  # [s] [P]
 
     class exam:
-        """The goal of the reward and of the exam."""
+        """The target of the reward and of the exam."""
 
         nose: Sign = -1.0  # -1 down, a handstand; 1 up, a footstand
         height: Positive = 0.55  # [m] of the root that suffices [P]

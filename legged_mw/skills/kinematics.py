@@ -1,6 +1,6 @@
 """Poses and velocities of a robot's bodies from qpos and qvel, in batched torch.
 
-The engine's body poses lag one substep and are zero after a reset. These are current.
+The engine's body poses are one substep old and zero after a reset. These poses are current.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Bodies(NamedTuple):
 
 
 class Kinematics:
-    """Forward kinematics of a robot with a free root and hinges, at most one a body."""
+    """Forward kinematics of a robot with a free root and at most one hinge per body."""
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[int], device: str) -> None:
         """``bodies`` are indices in ``model``; the call returns them in this order."""
@@ -56,12 +56,12 @@ class Kinematics:
         self._products, self._identity = tensor(_matrix_of_products()), tensor(np.eye(3).ravel())
         self._zero = tensor(model.qpos0[7:])
         self._axis, self._anchor = tensor(model.jnt_axis[hinges]), tensor(model.jnt_pos[hinges])
-        # a body without a joint: sine is 0
+        # sine is 0 for a body without a joint
         self._angle_of = places([model.jnt_qposadr[j] - 7 if j >= 0 else 0 for j in joints])
         self._speed_of = places([model.jnt_dofadr[j] for j in hinges])
         self._carried = places([order.index(int(model.jnt_bodyid[j])) for j in hinges])
         self._wanted = places([order.index(body) for body in bodies])
-        # each level below the root: its parents in the level above, and its span in ``order``
+        # for each level below the root: parents in the level above, and the range in ``order``
         self._levels, start = list[tuple[Tensor, slice]](), 0
         for upper, level in zip(levels, levels[1:], strict=False):
             parents = [upper.index(int(model.body_parentid[body])) for body in level]
@@ -74,14 +74,14 @@ class Kinematics:
         local = self._constant + torch.sin(angle) * self._sine + (1.0 - torch.cos(angle)) * self._cosine
         products = (qpos[:, 3:7, None] * qpos[:, None, 3:7]).flatten(1)
         turn = rotate(self._products, products).add_(self._identity).view(-1, 1, 3, 3)
-        frames = [torch.nn.functional.pad(turn, (0, 1))]  # (N, 1, 3, 4): turn, and place from the root
+        frames = [torch.nn.functional.pad(turn, (0, 1))]  # (N, 1, 3, 4): rotation, and position relative to the root
         for parents, span in self._levels:
             frames.append(product(frames[-1].index_select(1, parents), local[:, span]))
         every = torch.cat(frames, dim=1)
         carried, wanted = every.index_select(1, self._carried), every.index_select(1, self._wanted)
         axis = rotate(carried[..., :3], self._axis) * qvel.index_select(1, self._speed_of)[..., None]
         anchor = rotate(carried[..., :3], self._anchor) + carried[..., 3]
-        # of each hinge: angular velocity, and linear velocity at the root
+        # for each hinge: angular velocity, and linear velocity of its body at the root's origin
         twist = torch.cat([axis, torch.linalg.cross(anchor, axis)], dim=2)
         turning, moving = (self._above * twist[:, None]).sum(dim=2).split(3, dim=2)
         turning = turning + rotate(frames[0][..., :3], qvel[:, None, 3:6])
@@ -91,17 +91,17 @@ class Kinematics:
 
 
 def rotate(turn: Tensor, vector: Tensor) -> Tensor:
-    """A matrix (..., n, k) times ``vector`` (..., k), by sums: a GPU may round matrix products to ten bits."""
+    """Multiply a matrix (..., n, k) by ``vector`` (..., k) with sums: a GPU may round matrix products to ten bits."""
     return (turn * vector.unsqueeze(-2)).sum(dim=-1)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """(..., i, k) times (..., k, j), likewise."""
+    """Multiply (..., i, k) by (..., k, j), in the same way."""
     return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(dim=-2)
 
 
 def _matrix_of_products() -> np.ndarray:
-    """(9, 16) from the products of a unit quaternion's entries to its rotation matrix minus the identity."""
+    """(9, 16) matrix from products of a unit quaternion's entries to its rotation matrix minus the identity."""
     w, x, y, z = range(4)
     terms = np.zeros((3, 3, 4, 4))
     for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
@@ -127,7 +127,7 @@ def _levels(model: mujoco.MjModel, root: int, bodies: Sequence[int]) -> list[lis
 
 
 def _joint(model: mujoco.MjModel, body: int) -> int:
-    """The hinge between ``body`` and its parent; -1 for none."""
+    """The hinge between ``body`` and its parent; -1 without a hinge."""
     count, first = int(model.body_jntnum[body]), int(model.body_jntadr[body])
     if count > 1 or (count and model.jnt_type[first] != mujoco.mjtJoint.mjJNT_HINGE):
         what = f"body '{model.body(body).name}' moves by more than one hinge"
@@ -136,7 +136,7 @@ def _joint(model: mujoco.MjModel, body: int) -> int:
 
 
 def _local(model: mujoco.MjModel, body: int, joint: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Body to parent (4, 4): constant + sin(angle) * the second + (1 - cos(angle)) * the third."""
+    """The body's pose in its parent, as three (4, 4): constant + sin(angle) * second + (1 - cos(angle)) * third."""
     turn, here, away, back = np.zeros(9), *(np.eye(4) for _ in range(3))
     mujoco.mju_quat2Mat(turn, model.body_quat[body])
     here[:3, :3], here[:3, 3] = turn.reshape(3, 3), model.body_pos[body]

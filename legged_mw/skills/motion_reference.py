@@ -1,4 +1,4 @@
-"""Reference clips as fixed tensors: the frame of each world, and the start of new episodes.
+"""Reference clips as fixed tensors: the current frame of each world, and the start of new episodes.
 
 Shapes: N worlds, B bodies, M frames.
 """
@@ -17,7 +17,7 @@ from legged_mw.utils.files import find_file
 
 
 class Reference:
-    """Clips one after another, each with its last frame held. ``frame`` is each world's target in the next step."""
+    """Concatenated clips, each with its last frame held. ``frame`` is each world's target in the next step."""
 
     written = ("frame", "failures", "_row", "wanted_pos", "wanted_rot")
 
@@ -47,7 +47,7 @@ class Reference:
         self._table = torch.cat(tables)  # (M, W)
         self._last, self._bin_of, self._bins = places(last), places(bin_of), torch.tensor(bins, device=device)
         self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)  # (N,)
-        self.failures = torch.zeros(len(bins), device=device)  # average share of worlds that fall there in a step
+        self.failures = torch.zeros(len(bins), device=device)  # moving average: share of worlds that fall there
         self._row = torch.zeros(num_envs, self._table.shape[1], device=device)
         widths = [qpos.shape[1], qvel.shape[1], *(part[0].numel() for part in bodies)]
         self.qpos, self.qvel, *parts = self._row.split(widths, dim=1)
@@ -56,13 +56,13 @@ class Reference:
         self.wanted_pos, self.wanted_rot = torch.zeros_like(self.bodies.pos), torch.zeros_like(self.bodies.rot)
 
     def read(self) -> None:
-        """Read the worlds' frames from the table."""
+        """Read the current frames of the worlds from the table."""
         torch.index_select(self._table, 0, self.frame, out=self._row)
 
     def align(self, body: Bodies, anchor: int) -> None:
-        """Move the frames' bodies to a robot's ``anchor``: its x, y and heading, but the clip's height."""
+        """Move the frames' bodies to a robot's ``anchor``: to its x, y and heading, with the clip's height."""
         ours, theirs = body.rot[:, anchor], self.bodies.rot[:, anchor]
-        cos, sin = (ours[:, :2] * theirs[:, :1]).sum(dim=2).unbind(dim=1)  # of the turn between both, seen from above
+        cos, sin = (ours[:, :2] * theirs[:, :1]).sum(dim=2).unbind(dim=1)  # of the yaw between both
         size = torch.hypot(cos, sin).clamp(min=1e-6)
         cos, sin, zero = cos / size, sin / size, torch.zeros_like(cos)
         turn = torch.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1.0], dim=1).unflatten(1, (1, 3, 3))
@@ -72,11 +72,11 @@ class Reference:
         self.wanted_rot.copy_(product(turn, self.bodies.rot))
 
     def advance(self) -> None:
-        """Go to the next frame, if there is one."""
+        """Go to the next frame, except at the last one."""
         self.frame.copy_(torch.minimum(self.frame + 1, self._last.index_select(0, self.frame)))
 
     def over(self) -> Tensor:
-        """(N,) The last frame is reached, held ones included."""
+        """(N,) True at the last frame, after the held ones."""
         return self.frame >= self._last.index_select(0, self.frame)
 
     def remember_failures(self, fell: Tensor, rate: float) -> None:
@@ -85,7 +85,7 @@ class Reference:
         self.failures.lerp_(count / len(fell), rate)
 
     def draw(self, uniform: float) -> Tensor:
-        """(N,) Start frames, uniform in a bin; bins by failures, for a share ``uniform`` equally. [BeyondMimic]"""
+        """(N,) Start frames. Bins are drawn by failures, or uniformly with probability ``uniform``. [BeyondMimic]"""
         chance = torch.rand(2, len(self.frame), device=self.frame.device)
         weights = self.failures / self.failures.sum().clamp(min=1e-9) * (1.0 - uniform) + uniform / len(self.failures)
         weights = weights.cumsum(0)
@@ -94,9 +94,9 @@ class Reference:
         return first + torch.minimum((chance[1] * count).long(), count - 1)
 
     def begin(self, mask: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Begin at the frames ``start`` (N,) where ``mask`` (N,) is true; None: the first clip's first frame.
+        """Begin at frames ``start`` (N,) where ``mask`` (N,) is true; None: at the first frame of the first clip.
 
-        Returns the states at ``start``: qpos (N, nq), qvel (N, nv). The next frame is the target.
+        Returns the states at ``start``: qpos (N, nq), qvel (N, nv). The target is the next frame.
         """
         start = torch.zeros_like(self.frame) if start is None else start
         self.frame.copy_(torch.where(mask, start + 1, self.frame))
@@ -106,11 +106,11 @@ class Reference:
 
 
 def load_clips(cfg: MotionTrackingCfg, joints: Sequence[str], rate: float) -> list[Clip]:
-    """The clips ``motion.clips`` of these ``joints``, at ``rate`` frames a second."""
+    """The clips ``motion.clips`` with these ``joints``, at ``rate`` frames per second."""
     files = [find_file(cfg, "motion.clips", name) for name in cfg.motion.clips]
     return [read_clip(file).at(rate).of(joints, file.name) for file in files]
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
-    """(...,) [rad] between rotations (..., 3, 3): their difference has the norm sqrt(8) sin(angle / 2)."""
+    """(...,) [rad] angle between rotations (..., 3, 3): their difference has the norm sqrt(8) sin(angle / 2)."""
     return 2.0 * torch.asin(((a - b).square().sum(dim=(-1, -2)) / 8.0).clamp(max=1.0).sqrt())

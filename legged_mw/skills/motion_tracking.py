@@ -1,7 +1,7 @@
-"""A robot follows reference clips, read top to bottom. The rules of ``robot_task`` hold here too.
+"""A robot tracks reference clips. Read the class from top to bottom. The rules of ``robot_task`` also hold here.
 
-The recipe is BeyondMimic's [B] (arXiv 2508.08241), as in its code and mjlab's [M]. Bodies are compared at the anchor:
-the reference is moved to the robot's anchor and turned to its heading. Shapes: N worlds, D joints, B bodies.
+The method is BeyondMimic's [B] (arXiv 2508.08241), as in its code and in mjlab's [M]. Bodies are compared relative to
+the anchor: the reference is moved to the anchor's x, y and heading. Shapes: N worlds, D joints, B bodies.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from legged_mw.utils.math import assign
 
 
 class MotionTracking(RobotTask):
-    """N robots that each follow a clip from somewhere in it to its end."""
+    """N robots, each of which tracks a clip from a drawn frame to the end."""
 
     cfg: MotionTrackingCfg
     exam = "tracking"
@@ -28,8 +28,8 @@ class MotionTracking(RobotTask):
 
     def _refresh_base(self) -> None:
         super()._refresh_base()
-        for kept, found in zip(self.body, self.kinematics(self.sim.qpos, self.sim.qvel), strict=True):
-            kept.copy_(found)
+        for buffer, value in zip(self.body, self.kinematics(self.sim.qpos, self.sim.qvel), strict=True):
+            buffer.copy_(value)
 
     def _update_state(self) -> None:
         super()._update_state()
@@ -41,7 +41,7 @@ class MotionTracking(RobotTask):
         self.reference.advance()
 
     def _fallen(self) -> Tensor:
-        """(N,) The robot fell, or it is far from the reference in height or tilt."""
+        """(N,) True after a fall, or far from the reference in height or tilt."""
         end, ours, theirs = self.cfg.termination, self.body, self.reference.bodies
         down = super()._fallen()
         down |= (ours.pos[:, self.anchor, 2] - theirs.pos[:, self.anchor, 2]).abs() > end.max_anchor_height
@@ -51,11 +51,11 @@ class MotionTracking(RobotTask):
         return down
 
     def _timed_out(self) -> Tensor:
-        """(N,) Out of time, or the clip is over."""
+        """(N,) True at the time limit, or at the end of the clip."""
         return super()._timed_out() | self.reference.over()
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Robots near the reference, at a frame drawn by past failures."""
+        """Set robots near the reference, at a frame drawn by past failures."""
         motion = self.cfg.motion
         qpos, qvel = self.reference.begin(mask, self.reference.draw(motion.uniform) if motion.random_start else None)
         off = torch.rand(self.num_envs, len(self.start_range), device=self.device).mul_(2.0).sub_(1.0)
@@ -82,7 +82,7 @@ class MotionTracking(RobotTask):
         super().compute_observations()
 
     def _anchor_seen(self) -> tuple[Tensor, Tensor]:
-        """Place (N, 3) [m] and attitude (N, 3, 3) of the anchor by the robot's encoders, which may have offsets."""
+        """Position (N, 3) [m] and attitude (N, 3, 3) of the anchor from the encoders, which may have offsets."""
         if self.actuators.encoder_offset is None:
             return self.body.pos[:, self.anchor], self.body.rot[:, self.anchor]
         joints = self.dof_pos + self.actuators.encoder_offset
@@ -94,7 +94,7 @@ class MotionTracking(RobotTask):
         # [rad], [rad/s]
         angles = {"reference_joint_pos": self.reference.joint_pos, "reference_joint_vel": self.reference.joint_vel}
         clip = [Row(name, value, mirror="joint") for name, value in angles.items()]
-        # the reference's anchor in the robot's: its place [m], two columns of its rotation
+        # the reference's anchor relative to the robot's: position [m], two columns of its rotation
         anchors = [
             Row("anchor_pos", self.anchor_pos, mirror="polar"),
             Row("anchor_ori", self.anchor_ori, mirror="turn"),
@@ -106,8 +106,8 @@ class MotionTracking(RobotTask):
             "privileged_state": [
                 *clip,
                 *anchors,
-                Row("body_pos", self.body_pos, mirror="body_polar"),  # of each body in the anchor's frame [m]
-                Row("body_ori", self.body_ori, mirror="body_turn"),  # two columns of the rotation of each
+                Row("body_pos", self.body_pos, mirror="body_polar"),  # of each body, anchor frame [m]
+                Row("body_ori", self.body_ori, mirror="body_turn"),  # two columns of each body's rotation
                 *self._body_rows(),
                 Row("last_actions", self.last_actions, mirror="joint"),
                 *self._disturbance_rows(),
@@ -120,7 +120,7 @@ class MotionTracking(RobotTask):
     # ---- rewards ----------------------------------------------------------------------------------------------------
 
     def _near(self, squares: Tensor, sigma: float) -> Tensor:
-        """(N,) 1 where the mean of ``squares`` (N, bodies) is 0."""
+        """(N,) exp(-mean of ``squares`` (N, bodies) / sigma^2)."""
         return torch.exp(-squares.mean(dim=1) / sigma**2)
 
     def _reward_tracking_anchor_pos(self) -> Tensor:
@@ -154,7 +154,7 @@ class MotionTracking(RobotTask):
         return self._near(off.square().sum(dim=2), self.cfg.rewards.body_ang_vel_sigma)
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Mean distance of the bodies from the reference, at the anchor [mm]."""
+        """Mean distance of the bodies from the reference, relative to the anchor [mm]."""
         off = ((self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0).nan_to_num(0.0, 0.0, 0.0)
         mean = torch.stack([off.sum(), torch.full_like(off[0], len(off))])
         return super()._live_statistics() | {"body_error_mm": mean}
@@ -165,7 +165,7 @@ class MotionTracking(RobotTask):
         return {**super().training_state(), "motion_failures": self.reference.failures.clone()}
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from ``training_state`` with new episodes, unless the clips have changed."""
+        """Load ``training_state`` and start new episodes, unless the clips have changed."""
         super().load_training_state(state)
         if "motion_failures" in state and state["motion_failures"].shape == self.reference.failures.shape:
             self.reference.failures.copy_(state["motion_failures"])
@@ -191,12 +191,12 @@ class MotionTracking(RobotTask):
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """The attitude (..., 4) that turns by ``b`` first, then by ``a``."""
+    """The product of attitudes (..., 4): rotation ``b``, then ``a``."""
     w, u, s, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     return torch.cat([w * s - (u * v).sum(dim=-1, keepdim=True), w * v + s * u + torch.linalg.cross(u, v)], dim=-1)
 
 
 def rotation_quat(v: Tensor) -> Tensor:
-    """The attitude (..., 4) that turns about ``v`` (..., 3) by its length [rad]."""
+    """The attitude (..., 4) rotated about ``v`` (..., 3) by its length [rad]."""
     half = v.norm(dim=-1, keepdim=True) / 2.0
     return torch.cat([torch.cos(half), v * (0.5 * torch.sinc(half / torch.pi))], dim=-1)

@@ -1,4 +1,4 @@
-"""The fields that following a motion adds to RobotTask's, typed, with unit and source.
+"""The fields of motion tracking, in addition to RobotTask's, with type, unit and source.
 
 Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] with the reason.
 """
@@ -14,7 +14,7 @@ from legged_mw.utils.errors import unknown
 
 FileNames = list[Annotated[str, Bound("the name of a file", bool)]]
 NonNegativeVector = Annotated[list[NonNegative], THREE]
-_BEGINNINGS = {  # fields of init_state that are not read, as episodes begin in a clip -> fields of motion instead
+_BEGINNINGS = {  # fields of init_state that have no effect, as episodes begin in a clip -> fields of motion instead
     "pos_xy_range": "start_pos",
     "yaw_range": "start_turn",
     "lin_vel_range": "start_lin_vel",
@@ -24,21 +24,21 @@ _BEGINNINGS = {  # fields of init_state that are not read, as episodes begin in 
 
 
 class MotionTrackingCfg(RobotTaskCfg):
-    """Following reference clips."""
+    """Motion tracking of reference clips."""
 
     class env(RobotTaskCfg.env):
         episode_length_s = 10.0
 
     class motion:
-        clips: FileNames = []  # .npz as `python -m legged_mw.motion --out` writes them; any frame rate
-        bodies: list[str] = []  # bodies to compare with the reference
-        anchor: str = ""  # the one of them at which they are compared
-        end_bodies: list[str] = []  # those of them that mean a fall when far too high or low
+        clips: FileNames = []  # .npz files from `python -m legged_mw.motion --out`; any frame rate
+        bodies: list[str] = []  # bodies that are compared with the reference
+        anchor: str = ""  # the body relative to which they are compared
+        end_bodies: list[str] = []  # bodies whose height error beyond max_end_height is a fall
         # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
         random_start: bool = True
-        hold_s: Duration = 1.0  # the last frame is held so long, then the episode times out [s] [ours: as deploy]
+        hold_s: Duration = 1.0  # duration of the held last frame, before the time out [s] [ours: as deploy]
         bin_s: Seconds = 1.0  # length of a bin [s]
-        failure_rate: PositiveShare = 0.001  # share of a step in the moving average of the failures in each bin
+        failure_rate: PositiveShare = 0.001  # weight of a step in the moving average of failures per bin
         # share of the episodes that begin in any bin [-] [ours: B's code adds it to failures, where it is negligible]
         uniform: PositiveShare = 0.1
         # offsets from the reference as an episode begins, each U(-range, range): x, y, z [m]
@@ -46,12 +46,12 @@ class MotionTrackingCfg(RobotTaskCfg):
         start_turn: NonNegativeVector = [0.1, 0.1, 0.2]  # about x, y, z [rad]
         start_lin_vel: NonNegativeVector = [0.5, 0.5, 0.2]  # [m/s]
         start_ang_vel: NonNegativeVector = [0.52, 0.52, 0.78]  # [rad/s]
-        start_joints: NonNegative = 0.1  # each joint, within its soft limits [rad]
+        start_joints: NonNegative = 0.1  # of each joint, within its soft limits [rad]
 
     class termination(RobotTaskCfg.termination):
-        max_anchor_height: Positive = 0.25  # between the anchor's height and its reference's; more is a fall [m]
-        max_anchor_tilt: Positive = 0.8  # between the z components of their z axes [-]
-        max_end_height: Positive = 0.25  # between the heights of an end body [m]
+        max_anchor_height: Positive = 0.25  # height error of the anchor; a larger one is a fall [m]
+        max_anchor_tilt: Positive = 0.8  # tilt error of the anchor: difference of z components of the z axes [-]
+        max_end_height: Positive = 0.25  # height error of an end body [m]
 
     class rewards(RobotTaskCfg.rewards):
         only_positive_rewards = False

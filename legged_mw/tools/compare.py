@@ -108,14 +108,14 @@ def _graded(report: Path) -> dict[str, float]:
         exam = json.loads(report.read_text(encoding="utf-8"))["columns"][0]["exam"]
     except (OSError, ValueError, LookupError, TypeError):
         return {}
-    found = dict(_flat({name: each for name, each in exam.items() if name != "rules"}))
+    values = dict(_flat({name: each for name, each in exam.items() if name != "rules"}))
     axes = {
         f"{path} {axis}": each
-        for path, value in found.items()
+        for path, value in values.items()
         if path in AXES_OF
         for axis, each in zip(AXES, value, strict=False)
     }
-    return {path: float(value) for path, value in {**found, **axes}.items() if isinstance(value, int | float)}
+    return {path: float(value) for path, value in {**values, **axes}.items() if isinstance(value, int | float)}
 
 
 def _flat(values: Any, path: str = "") -> list[tuple[str, Any]]:

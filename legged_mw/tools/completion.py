@@ -1,6 +1,6 @@
-"""legged-mw completion bash | zsh: a script that completes programs, flags, tasks, config fields, policies and runs at the Tab key.
+"""legged-mw completion bash | zsh: a script that completes programs, flags, tasks, fields, policies and runs.
 
-The script is made once and starts no Python at a key press; make it again after an update, or in the folder of your own tasks.
+The script does not start Python at a key press. Make it again after an update, or in the folder of your own tasks.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _FILES = "$(ls *.py 2>/dev/null)"
 
 
 class _Caught(BaseException):
-    """Carries a program's parser out of its start, just before it reads the command line."""
+    """Carries a program's parser out of the program when it starts to parse the flags."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
         self.parser = parser
@@ -82,12 +82,12 @@ def fields() -> list[str]:
 
 
 def parser_of(name: str, start: Callable[[], None]) -> argparse.ArgumentParser:
-    """The parser of a program's flags. It is caught at the call of ``parse_args``."""
+    """The parser of a program's flags, caught at the call of ``parse_args``."""
 
     def caught(self: argparse.ArgumentParser, *_: Any, **__: Any) -> NoReturn:
         raise _Caught(self)
 
-    kept = argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv
+    saved = argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv
     argparse.ArgumentParser.parse_args = argparse.ArgumentParser.parse_known_args = caught  # type: ignore[method-assign]
     sys.argv = [f"legged-mw {name}"]
     try:
@@ -96,7 +96,7 @@ def parser_of(name: str, start: Callable[[], None]) -> argparse.ArgumentParser:
     except _Caught as found:
         return found.parser
     finally:
-        argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv = kept
+        argparse.ArgumentParser.parse_args, argparse.ArgumentParser.parse_known_args, sys.argv = saved
     raise UserError(f"legged-mw {name} reads no flags")
 
 

@@ -156,7 +156,7 @@ def machine() -> Iterator[Finding]:
     if hasattr(os, "sysconf"):
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    others = "others use this machine: what is measured now is slower than it could be"
+    others = "other programs use this machine: the measured speed is too low"
     busy = others if load > usable_cores() + 0.5 else ""
     yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}; load {load:.1f}", busy)
     free = shutil.disk_usage(Path.cwd()).free / 2**30
@@ -177,9 +177,9 @@ def training() -> Iterator[Finding]:
         if needs.marker is None:
             version = _version(needs.name)
             fits = bool(version) and needs.specifier.contains(version, prereleases=True)
-            wanted = "" if fits or not version else f", which is not {needs.specifier}"
+            note = "" if fits or not version else f", which is not {needs.specifier}"
             mend = "" if fits else f"pip install '{needs}'"
-            yield Finding(needs.name, f"{version or 'missing'}{wanted}", mend, needed=not version)
+            yield Finding(needs.name, f"{version or 'missing'}{note}", mend, needed=not version)
 
 
 def gpus() -> Iterator[Finding]:
@@ -203,8 +203,8 @@ def gpus() -> Iterator[Finding]:
     for index in range(torch.cuda.device_count()):
         facts = device_facts(device := f"cuda:{index}")
         driver = ".".join(map(str, facts.cuda or ()))
-        said = f"{facts.name}, {facts.memory:.0f} GiB, driver for CUDA {driver}, torch {torch.__version__}"
-        yield Finding(device, said)
+        text = f"{facts.name}, {facts.memory:.0f} GiB, driver for CUDA {driver}, torch {torch.__version__}"
+        yield Finding(device, text)
         yield Finding("memory pool", "yes" if facts.pool else "no")
         yield Finding("graphs", _records(device))
         yield Finding("kernels", f"{facts.compiled} modules of mujoco-warp are compiled for it in {facts.cache}")

@@ -311,8 +311,8 @@ def read_printed(file: Path) -> Printed:
     text = file.read_text(errors="replace").strip() if file.is_file() else ""
 
     def last(pattern: str) -> str:
-        found = re.findall(pattern, text, re.M)
-        return found[-1] if found else ""
+        matches = re.findall(pattern, text, re.M)
+        return matches[-1] if matches else ""
 
     done = bool(last(r"^done: "))
     exam = re.findall(r"(\w+) (-?\d+\.\d+)", last(r"^exam after \d+ iterations: (.*)$"))

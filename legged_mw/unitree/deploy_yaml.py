@@ -1,7 +1,7 @@
-"""An export in the form that unitree_rl_lab's program for a robot reads: ``params/deploy.yaml``, ``exported/policy.onnx``.
+"""An export in the format of unitree_rl_lab's program for a robot: ``params/deploy.yaml``, ``exported/policy.onnx``.
 
-Names and meanings are those of its ``export_deploy_cfg.py`` and ``deploy/include`` (commit e72a072c). Gains are in the order
-of the motors; everything else is in the policy's order.
+Names and meanings are those of its ``export_deploy_cfg.py`` and ``deploy/include`` (commit e72a072c). Gains are in the
+order of the motors; all other values are in the policy's order.
 """
 
 from __future__ import annotations

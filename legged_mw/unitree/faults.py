@@ -25,7 +25,7 @@ class Faults:
     jitter_ms: float = 0.0  # [ms] standard deviation of the delay
     loss: float = 0.0  # share of lost messages
     bad_crc: bool = False  # states with a wrong checksum
-    frozen: bool = False  # the same state is sent again and again
+    frozen: bool = False  # the same state is sent repeatedly
     # frozen parts of the state, by their names in NAN, and joints with frozen encoders
     stuck: set[str] = field(default_factory=set)
     silent: bool = False  # no states are sent
@@ -111,7 +111,7 @@ def _parse(text: str, joints: Sequence[str]) -> Fault:
     if name not in KINDS:
         raise UserError(f"{where}: {unknown('fault', name, KINDS, 'what a served robot can have')}")
     if not 0.0 <= (seconds := _number(time or "0")) < math.inf:
-        raise UserError(f"{where}: after @ stands when it begins, a number of seconds from 0")
+        raise UserError(f"{where}: after @ write the start time, a number of seconds from 0")
     kind = KINDS[name]
     return Fault(
         text,
@@ -130,7 +130,7 @@ def _value(name: str, kind: FaultKind, value: str | None, joints: Sequence[str],
         return value if name in words else {value}
     if value is None:
         if kind.value is None:
-            raise UserError(f"{where}: say of which joint, e.g. {name}={joints[0]}")
+            raise UserError(f"{where}: name the joint, e.g. {name}={joints[0]}")
         return kind.value / 100 if name == "loss" else kind.value
     if kind.value is True:
         raise UserError(f"{where}: {name} has no value but {OFF}")

@@ -293,7 +293,7 @@ class Wire(Commander):
             self._ask(RELEASE_MODE)
             self._until(lambda: False, moment)
         raise RobotError(
-            f"the robot's own program '{name}' does not let go of the motors: end it with the remote (L2+A, then L2+R2)"
+            f"the robot's own program '{name}' does not release the motors: end it with the remote (L2+A, then L2+R2)"
         )
 
     def _program(self) -> str:

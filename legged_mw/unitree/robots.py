@@ -92,7 +92,7 @@ def machine_of(joints: Sequence[str]) -> Machine:
         [name for name in nearest.motors if name not in joints],
     )
     raise RobotError(
-        f"{CONTRACT_FILE} is of no robot that is known here ({', '.join(MACHINES)}); the nearest is {nearest.name}. "
+        f"{CONTRACT_FILE} has the joints of no known robot ({', '.join(MACHINES)}); the nearest is {nearest.name}. "
         f"Only in the contract: {', '.join(only[0]) or 'none'}; only on {nearest.name}: {', '.join(only[1]) or 'none'}. "
         f"The contract has: {', '.join(joints)}; {nearest.name} has: {', '.join(nearest.motors)}"
     )
@@ -136,5 +136,5 @@ def check_body(machine: Machine, mode_machine: int) -> None:
         lacks = ", ".join(name for name, slot in machine.motors.items() if slot in _LACKS.get(count or 0, ()))
         raise RobotError(
             f"this {machine.name} has {has} (mode_machine {mode_machine}{f': no {lacks}' if lacks else ''}), "
-            f"the contract {len(machine.motors)}: {', '.join(machine.motors)}; use a policy of its own"
+            f"the contract {len(machine.motors)}: {', '.join(machine.motors)}; use a policy for this robot"
         )

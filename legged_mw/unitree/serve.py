@@ -212,16 +212,16 @@ class SimulatedUnitree:
     def _take(self, command: WireMessage) -> None:
         """Accept a valid command, reject any other."""
         if self.machine.package == "unitree_go":
-            kind, sent, wanted = (
+            kind, sent, expected = (
                 "head and level_flag",
                 (*map(int, command["head"]), int(command["level_flag"])),
                 LOW_LEVEL,
             )
         else:
-            kind, sent, wanted = "mode_machine", int(command["mode_machine"]), int(self._state["mode_machine"])
+            kind, sent, expected = "mode_machine", int(command["mode_machine"]), int(self._state["mode_machine"])
         wrong = [name for name in _PARTS if not (np.abs(command[f"motor_cmd.{name}"]) < _MOST).all()]
-        if sent != wanted:
-            self._refuse(kind, f"a command with {kind} {sent}, not {wanted}")
+        if sent != expected:
+            self._refuse(kind, f"a command with {kind} {sent}, not {expected}")
         elif not command.intact():
             self._refuse("checksum", f"a command with checksum {command['crc']:#x}, not {command.checksum():#x}")
         elif wrong:

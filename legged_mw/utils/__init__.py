@@ -1,1 +1,1 @@
-"""Numbers, configuration and tasks: what every other package may import, and which imports none of them."""
+"""Numbers, configuration and tasks. Every other package may import it; it imports none of them."""

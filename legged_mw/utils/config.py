@@ -131,7 +131,7 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
     try:
         kind = get_type_hints(SimpleNamespace(__annotations__={name: written}), names, include_extras=True)[name]
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
-        hint = f"import what it names at the top level of module {cls.__module__}"
+        hint = f"import its names at the top level of module {cls.__module__}"
         raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
     if not _is_supported(kind):
         choice = "int, float, bool, str, None, list[T], dict[str, T], Literal[...], Any, T | U; `class` makes a section"

@@ -51,7 +51,7 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
         if file.is_file():
             return file
     if written.is_absolute():
-        why = "an absolute path is of one machine: name the file relative to the task's"
+        why = "an absolute path is valid on one machine only: name the file relative to the task's"
         raise UserError(f"{path}: no file at {written}; {why}")
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
 
@@ -134,7 +134,7 @@ def check_folder(folder: Path) -> Path:
                 why = "a pipe, a socket or a device"
             if why:
                 wrong = f"{shown(folder)}: {path.relative_to(home)} is {why}"
-                raise UserError(f"{wrong}: delete it; a run or an export holds files alone")
+                raise UserError(f"{wrong}: delete it; a run or an export has only files")
     return folder
 
 

@@ -42,7 +42,7 @@ def free_memory(device: str = "cpu") -> float:
         return float(torch.cuda.mem_get_info(device)[0])
     lines = _read("/proc/meminfo").splitlines()
     free = [1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # of the container
+    limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # the container's
     # file cache of the container, which the system frees on demand
     cached = re.search(r"^inactive_file (\d+)$", _read("/sys/fs/cgroup/memory.stat"), re.MULTILINE)
     if limit.isdigit() and used.isdigit():

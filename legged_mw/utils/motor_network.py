@@ -104,10 +104,10 @@ def _take(arrays: Mapping[str, Any], name: str, *shape: int) -> Floats:
         raise ValueError(f"array '{name}' is missing")
     value = np.asarray(arrays[name], dtype=np.float32)
     same = value.ndim == len(shape)
-    wanted = tuple(own if size < 0 else size for own, size in zip(value.shape, shape, strict=True)) if same else shape
-    if value.shape != wanted:
+    expected = tuple(own if size < 0 else size for own, size in zip(value.shape, shape, strict=True)) if same else shape
+    if value.shape != expected:
         why = "(out, in), in from the layer before or the frames"
-        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {wanted}: {why}")
+        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {expected}: {why}")
     if not np.isfinite(value).all():
         raise ValueError(f"array '{name}' has values that are not finite")
     return value

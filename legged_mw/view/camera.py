@@ -1,4 +1,4 @@
-"""Moves an `MjvCamera`: follow a robot, stay behind it, or show all robots. It looks over hills."""
+"""Move an `MjvCamera`: follow a robot, stay behind it, or show all robots. Hills do not hide the robot."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from legged_mw.view.posed_robot import Placement, PosedRobots, RoughGround
 
-AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
+AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] in front of the robot, to its right, a little above
 ELEVATION_ALL = -35.0  # [deg]
 DISTANCE = 2.4  # [robot radius] least distance from camera to base
 BEHIND = 1.3 * DISTANCE  # the same for the camera behind the robot

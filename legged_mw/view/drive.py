@@ -117,16 +117,16 @@ class Pilot:
 
     def steer(self, command: ArrayLike) -> None:
         """Drive by `command` (C,), clipped to its ranges, from the session's next turn on."""
-        wanted = np.array(command, dtype=np.float64)
-        self._asked.put(lambda: self._steer(wanted))
+        values = np.array(command, dtype=np.float64)
+        self._asked.put(lambda: self._steer(values))
 
     def steer_one(self, column: int, value: float, own: FloatArray) -> None:
         """Drive by the command, at first the robot's `own` (C,), with `value` in this column, from the next turn on."""
 
         def change() -> None:
-            wanted = np.array(self.command if self.driving else own)
-            wanted[column] = value
-            self._steer(wanted)
+            values = np.array(self.command if self.driving else own)
+            values[column] = value
+            self._steer(values)
 
         self._asked.put(change)
 
@@ -154,9 +154,9 @@ class Pilot:
         """The commands (N, C) of the next step, given those of the stage. None: the stage's own."""
         if not self.driving:
             return None
-        wanted = np.array(own, dtype=np.float64)
-        wanted[self.driven()] = self.command
-        return wanted
+        values = np.array(own, dtype=np.float64)
+        values[self.driven()] = self.command
+        return values
 
     def driven(self) -> list[int]:
         """The worlds that the user drives, pushes and resets."""
@@ -286,9 +286,11 @@ def load_script(path: Path | str, table: Sequence[Command]) -> Script:
     loaded = load_yaml(path)
     listed = loaded.get("commands")
     if set(loaded) != {"commands"} or not isinstance(listed, list) or not listed:
-        found = ", ".join(map(str, loaded)) or "nothing"
+        content = ", ".join(map(str, loaded)) or "nothing"
         example = "{time: 0, command: [0.5, 0, 0]}"
-        raise ConfigError(f"{path}: write one list 'commands' with at least one entry, e.g. {example}; it has {found}")
+        raise ConfigError(
+            f"{path}: write one list 'commands' with at least one entry, e.g. {example}; it has {content}"
+        )
     entries: list[ScriptEntry] = []
     for number, item in enumerate(listed, start=1):
         where = f"{path}: entry {number} of commands"

@@ -21,8 +21,8 @@ from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
 
 VIEWERS = ("auto", "native", "web", "video", "none")
-UNSEEN = ("auto", "none")  # where a program shows nothing, both are the same
-ROBOTS_SHOWN = 64  # at most: drawing more takes longer than a control step
+UNSEEN = ("auto", "none")  # values of --viewer that are equal where a program shows nothing by default
+ROBOTS_SHOWN = 64  # largest number of drawn robots: more take longer than a control step
 SECONDS = 10.0  # ours: duration of a recording, or of a run without a viewer
 
 

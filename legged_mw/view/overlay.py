@@ -1,4 +1,4 @@
-"""Extra geoms of a picture: velocity arrows, foot contacts, places of falls, and the reference motion as ghosts.
+"""Extra geoms of a picture: velocity arrows, foot contacts, positions of falls, and the reference motion as ghosts.
 
 Appends to a `mujoco.MjvScene`. Opens no window, no file and no OpenGL context.
 """
@@ -133,7 +133,7 @@ def _draw_ghosts(scene: mujoco.MjvScene, robots: PosedRobots, qpos: FloatArray) 
 
 
 def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:
-    """Append a ball with the word "fell" at the place of a fall."""
+    """Append a ball with the word "fell" at the position of a fall."""
     _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.35 * radius,) * 3, place, FALL_RGBA, "fell")
 
 

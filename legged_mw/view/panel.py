@@ -1,8 +1,8 @@
-"""The web page's panel for one pilot: numbers, sliders, buttons, keys and curves in Dear ImGui, or all but curves as data.
+"""The web page's panel for one pilot: numbers, sliders, buttons, keys and curves in Dear ImGui; all but curves as data.
 
 The viewer's thread builds the panel for every picture from the last moment and the pilot. ImGui ends the process if an
-exception leaves a block open, so all code that can fail runs before a block is opened. Keys do not come through ImGui,
-which sees them once a picture: the page sends each as it is pressed.
+exception leaves a block open, so all code that can raise runs before a block is opened. Keys do not go through ImGui,
+which reads them once per picture: the page sends each key at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from legged_mw.view.stage import FloatArray, Moment, velocity_columns
 CURVE_SECONDS, CURVE_POINTS = 10.0, 100
 WIDTH, COLUMN = 330, 90  # [px] width of the panel, start of its second column
 NARROW = 600  # [px] on a narrower screen, such as a phone's, the panel is folded at first
-KEY_NAMES = {  # KeyboardEvent.key of a browser -> ours, where it is not the same letter
+KEY_NAMES = {  # KeyboardEvent.key of a browser -> our name, if it is not the same letter
     **{"ArrowUp": "up", "ArrowDown": "down", "ArrowLeft": "left", "ArrowRight": "right"},
     **{" ": "space", "Backspace": "backspace", "Enter": "enter"},
 }
@@ -77,8 +77,8 @@ class Panel:
         if self._folded:
             ui.SetNextWindowCollapsed(True)
         try:
-            opened, kept = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
-            self._folded = not kept  # the close button folds the panel, a click on the title unfolds it
+            opened, is_open = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
+            self._folded = not is_open  # the close button folds the panel, a click on the title unfolds it
             if opened:
                 self._numbers(moment)
                 if "own" in self.pilot.can:
@@ -89,10 +89,10 @@ class Panel:
         finally:
             ui.End()
 
-    # ---- what a page asks for, on any thread
+    # ---- requests of a page, from any thread
 
     def press(self, key: str, studio: bool) -> None:
-        """Do the action of a browser's key. `studio`: it was pressed on Studio's page, where the user may be typing."""
+        """Do the action of a browser's key. `studio`: pressed on Studio's page, where the user may type a number."""
         if not (studio and self._typing):
             self.pilot.press(KEY_NAMES.get(key, key.lower()))
 
@@ -115,7 +115,7 @@ class Panel:
         self.pilot.push_speed = min(max(speed, 0.0), PUSH_MAX)
 
     def facts(self) -> dict[str, Any]:
-        """The panel as data that JSON can hold, for a page without ImGui."""
+        """The panel as JSON data, for a page without ImGui."""
         pilot, moment, sliders = self.pilot, self.moment, []
         if moment is not None and "own" in pilot.can:
             values = self._command(moment)
@@ -136,7 +136,7 @@ class Panel:
             "help": pilot.help,
         }
 
-    # ---- ImGui's
+    # ---- ImGui
 
     def _numbers(self, moment: Moment) -> None:
         ui = self.ui
@@ -174,7 +174,7 @@ class Panel:
             for place, (action, label) in enumerate(row):
                 if place:
                     ui.SameLine()
-                if ui.Button(f"{self._words(action, label)}###{action}", size):  # ImGui knows it by the part after ###
+                if ui.Button(f"{self._words(action, label)}###{action}", size):  # ImGui's ID is after ###
                     self.click(action)
         ui.SetNextItemWidth(0.62 * WIDTH)
         if "push" in pilot.can:
@@ -183,12 +183,12 @@ class Panel:
             pilot.ask("everyone")
 
     def _rows(self) -> list[list[tuple[str, str]]]:
-        """BUTTONS as far as the pilot can do them."""
+        """The rows of BUTTONS, with the pilot's available actions only."""
         can = self.pilot.can - (set() if self.pilot.num_worlds > 1 else {"next"})
         return [[(action, label) for action, label in row if action in can] for row in BUTTONS]
 
     def _words(self, action: str, label: str) -> str:
-        """The text of a button now."""
+        """The current text of a button."""
         pilot = self.pilot
         words = {
             **pilot.words,

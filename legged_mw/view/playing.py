@@ -1,6 +1,6 @@
-"""Watching the training environment: the flags of play, the config as it is played, the environment as a stage.
+"""Watch the training environment: the flags of play, the config for playing, and the environment as a stage.
 
-Also the viewer of a policy that is still being trained. Only this file of `view/` imports torch and the environment.
+Also the viewer of a policy in training. In `view/` only this file imports torch and the environment.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.stage import BoolArray, FloatArray
 
-if TYPE_CHECKING:  # it imports git, a tenth of a second that play does not need
+if TYPE_CHECKING:  # it imports git, which takes 0.1 s and is not needed here
     from legged_mw.rl.runner import Runner
 
 NOMINAL = {  # overrides of the trained config for playing
@@ -118,9 +118,9 @@ def parse(description: str | None) -> argparse.Namespace:
 
 
 def check_together(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Refuse flags that mean nothing together."""
-    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
-    if len(asked) > 1 or (args.eval and args.command is not None):
+    """Refuse flags that have no meaning together."""
+    flags = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
+    if len(flags) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     for name, why in OF_THE_EXAM.items():
         if getattr(args, name) not in (None, False) and not args.eval:
@@ -130,9 +130,9 @@ def check_together(args: argparse.Namespace, parser: argparse.ArgumentParser) ->
     if args.export and (args.set or args.override or args.command is not None):
         parser.error("--export writes the policy as it was trained: leave --set, --override and --command out")
     if args.half and not args.export:
-        parser.error("--half rounds what is exported: add --export DIR")
+        parser.error("--half rounds an export: add --export DIR")
     if args.commands and (args.eval or args.export or args.command is not None):
-        parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
+        parser.error("--commands drives a watched robot: leave out --command, --eval and --export")
     if (args.eval or args.export) and (watching := launch.asked(args)):
         parser.error(f"--eval and --export show nothing: leave {', '.join(watching)} out")
 
@@ -252,7 +252,7 @@ class EnvStage:
         self._believed = believed_velocity(self.policy, self._obs)
         self._obs, _, dones, _ = env.step(self.policy(self._obs))
         forget(self.policy, dones)
-        self._overflowed = self._overflowed or say_overflow(env.sim, "what is shown")
+        self._overflowed = self._overflowed or say_overflow(env.sim, "the shown simulation")
 
     @property
     def news(self) -> str:
@@ -301,29 +301,29 @@ class EnvStage:
 
 
 def _columns_of(env: RobotTask, wanted: str) -> list[tuple[str, slice, Tensor]]:
-    """The places of a row's newest values in the observations, also in nested groups: (group, columns, scales)."""
-    found: list[tuple[str, slice, Tensor]] = []
+    """The columns of a row's newest values in the observations, also in nested groups: (group, columns, scales)."""
+    places: list[tuple[str, slice, Tensor]] = []
     for group, rows in env.observations.groups.items():
         for row in rows:
             newest = env.observations.newest(group, row.name)
             if row.name == wanted:
-                found.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
+                places.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
             elif row.group:
-                inside = [(columns, scales) for name, columns, scales in found if name == row.group]
-                found += [
+                inside = [(columns, scales) for name, columns, scales in places if name == row.group]
+                places += [
                     (group, slice(newest.start + cols.start, newest.start + cols.stop), scales)
                     for cols, scales in inside
                 ]
-    return found
+    return places
 
 
 def _array(tensor: Tensor) -> FloatArray:
     return tensor.cpu().numpy().astype(np.float64)
 
 
-# ---- a policy that is still being trained: train --play writes it, play --follow reads it again
+# ---- a policy in training: train --play writes it, play --follow reads it again
 
-PLAYING = "playing.pt"  # the actor that train --play writes into its run for the viewer, more often than checkpoints
+PLAYING = "playing.pt"  # the actor that train --play writes for the viewer, more often than checkpoints
 _CHECK_SECONDS = 2.0  # between two checks of the folder
 _SAVE_SECONDS = 15.0  # between two saves of the policy for the viewer
 

@@ -95,13 +95,13 @@ class PosedRobots:
         touching = np.asarray(contacts, dtype=bool)[: self.count]
         if len(touching) < self.count or touching.shape[1] > len(self.feet):
             return []  # the model has fewer contact sensors
-        found = []
+        result = []
         for world, marked in enumerate(touching):
             geoms = self._feet[self._order.index(world)][: len(marked)]
             for foot in feet_of(self.model, geoms):
                 if down := [geoms[place] for place in foot if marked[place]]:
-                    found.append(patch(self.model, self.data, down, self.radius))
-        return found
+                    result.append(patch(self.model, self.data, down, self.radius))
+        return result
 
     def _forward(self) -> None:
         mujoco.mj_kinematics(self.model, self.data)

@@ -1,4 +1,4 @@
-"""Pictures without a screen: an offscreen renderer, a viewer that records a video and a contact sheet, files of frames.
+"""Pictures without a screen: an offscreen renderer, a viewer that records a video and a contact sheet, and image files.
 
 `MUJOCO_GL` must be set before mujoco is imported. The package does that.
 """
@@ -28,9 +28,9 @@ Frame = NDArray[np.uint8]  # (height, width, 3)
 
 # ours: edge of the shadow map [px]; the common value 8192 halves the frame rate of software OpenGL
 SHADOW_MAX = 2048
-LIVE = 0, 16, 8  # ours: samples of a pixel, slices and stacks of a sphere; a G1 takes 21 ms of a core instead of 200
+LIVE = 0, 16, 8  # ours: samples per pixel, slices and stacks of a sphere; a G1 takes 21 ms of a core instead of 200
 GEOMS_MAX = 20_000
-# [m] beyond the camera's distance: terrain tiles farther than that from its target are drawn coarse
+# [m] beyond the camera's distance; terrain tiles farther away are drawn coarse
 FINE_REACH = 3.0
 TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller fonts
 SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, pictures per row, largest width of a picture [px]
@@ -40,8 +40,8 @@ GIF_FPS, GIF_WIDTH = 12.5, 640  # GIF times are in 0.01 s; larger values make la
 class RobotRenderer:
     """Offscreen pictures of robots from a camera that follows one. Use it only on the thread that created it.
 
-    `robots`: a model of one, of which `count` are drawn; or posed ones, which it changes. `live`: fast on a CPU, without
-    shadows and smooth edges; and `move_camera` turns the camera.
+    `robots`: a model of one robot, drawn `count` times; or posed robots, whose poses it changes. `live`: fast on a CPU,
+    without shadows and smooth edges, and `move_camera` turns the camera.
     """
 
     def __init__(

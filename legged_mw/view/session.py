@@ -15,10 +15,10 @@ from legged_mw.utils.commands import LABELS, Command, with_units
 from legged_mw.view.drive import Pilot, Script
 from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity, top_speed
 
-FALL_SECONDS = 2.0  # ours: [s] display time of the place of a fall
+FALL_SECONDS = 2.0  # ours: [s] display time of the position of a fall
 SETTLING = 1.0  # [s] ours: start of a segment to leave out of its mean velocity, if it lasts longer than twice this
 PACE_SECONDS = 0.5  # [s] interval for measuring the pace
-PATIENT = 3.0  # [s] ours: a recording that takes longer says how long
+PATIENT = 3.0  # [s] ours: a recording that takes longer prints its duration
 MEASURED = ", ".join(LABELS.values())
 
 
@@ -127,7 +127,7 @@ class Session:
             self._say_how_long()
 
     def _say_how_long(self) -> None:
-        """Print how long the rest takes, by the first second. Drawing without a GPU takes several times real time."""
+        """Print the remaining duration, estimated from the first second: drawing without a GPU is slow."""
         begun, _, _ = self._measured
         left = (time.perf_counter() - begun) * ((self.seconds or 0.0) / self.time - 1.0)
         if left > PATIENT:

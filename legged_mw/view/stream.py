@@ -1,7 +1,7 @@
-"""The page for a browser that draws too slowly: pictures drawn here, driven over the same guarded port. Also all pages' keys.
+"""The page of pictures, for a browser that draws too slowly, on the same guarded port. It also handles all pages' keys.
 
-`/drawn` is the page and `/stream` its WebSocket; Studio's page sends its keys there too. A browser asks for each picture,
-so a slow link gets fewer of them. One thread draws them all, with a camera of its own that the driving page turns.
+`/drawn` is the page and `/stream` its WebSocket, which also gets the keys of Studio's page. A browser requests each
+picture, so a slow link gets fewer. One thread draws them all, with its own camera, which the driving page turns.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from legged_mw.view.recorder import RobotRenderer
 from legged_mw.view.stage import ViewError
 
 PAGE = Path(__file__).with_name("drawn.html").read_bytes()
-ADDED = Path(__file__).with_name("studio.html").read_bytes()  # to Studio's page: it measures, and sends keys
-WIDTH, HEIGHT = 640, 360  # [px] of a picture
-FPS = 15.0  # ours: pictures a second at most; with more, software OpenGL takes a core from the control loop
-QUALITY = 80  # ours: of the JPEGs, of 100; about 18 kB each
-VIDEO_FPS = 25.0  # the camera's filters count in frames of a video
-WATCHERS = 9  # pages at most, as Studio's own limit
-MESSAGE, MOST = 200, 100.0  # a page's request at most: its length, a number in it
-SILENT = 10.0  # [s] without a request: a page asleep or gone; it watches no more, so that another may drive
-NEXT = "next"  # a page's request for one more picture
-# codes of closing: Studio's for a page that may not drive and for one too many, WebSocket's for a bad request
+ADDED = Path(__file__).with_name("studio.html").read_bytes()  # for Studio's page: it measures and sends keys
+WIDTH, HEIGHT = 640, 360  # [px] size of a picture
+FPS = 15.0  # ours: largest number of pictures per second; software OpenGL needs a whole core for more
+QUALITY = 80  # ours: quality of the JPEGs, of 100; a picture has about 18 kB
+VIDEO_FPS = 25.0  # frame rate for the camera's filters
+WATCHERS = 9  # largest number of pages, as in Studio
+MESSAGE, MOST = 200, 100.0  # of a page's request: largest length, largest number
+SILENT = 10.0  # [s] a page without a request for this time is inactive, so that another page may drive
+NEXT = "next"  # a page's request for a picture
+# codes for closing: Studio's for a page that may not drive and for too many pages, WebSocket's for a bad request
 TAKEN, FULL, BAD = 4001, 4002, 1008
 
 Handler = Callable[[Any], Awaitable[None]]
 
 
 class Stream:
-    """Pictures, numbers and requests of the pages at `/stream`. The first page that came drives, of either kind."""
+    """Pictures, numbers and requests of the pages at `/stream`. The first page of either kind drives."""
 
     def __init__(self, robots: PosedRobots, panel: Panel) -> None:
-        self._robots, self._panel = copy.deepcopy(robots), panel  # compiling them would stop the session
-        self._artist = ThreadPoolExecutor(1, "artist", _step_back)  # an OpenGL context belongs to one thread
-        self._renderer: RobotRenderer | None = None  # made for the first page that asks
+        self._robots, self._panel = copy.deepcopy(robots), panel  # to compile them would stop the session
+        self._artist = ThreadPoolExecutor(1, "artist", _step_back)  # only one thread may use an OpenGL context
+        self._renderer: RobotRenderer | None = None  # made at the first request
         self._picture, self._drawn = b"", 0.0  # the last JPEG, its time [s]
-        self._moves: deque[tuple[int, float, float]] = deque(maxlen=100)  # of the camera, for the next picture
-        self._studio: list[tuple[Any, str]] = []  # Studio's sockets /ui with their sessions
-        self._watching: dict[Any, float] = {}  # sockets that asked for pictures -> time of the last request [s]
+        self._moves: deque[tuple[int, float, float]] = deque(maxlen=100)  # camera motion for the next picture
+        self._studio: list[tuple[Any, str]] = []  # Studio's sockets at /ui, and their sessions
+        self._watching: dict[Any, float] = {}  # sockets with a request -> time of the last request [s]
 
     def around(self, studio: Handler) -> Handler:
-        """Studio's handler of WebSockets, with `/stream` beside it. While a page of ours drives, no page of Studio's does."""
+        """Studio's WebSocket handler with `/stream` added. While our page drives, no page of Studio's does."""
         from websockets.exceptions import ConnectionClosed
 
         async def handle(socket: Any) -> None:
@@ -81,12 +81,12 @@ class Stream:
 
     def close(self) -> None:
         """Free the OpenGL context. May be called twice."""
-        with suppress(RuntimeError):  # the interpreter ends, or it is closed already
+        with suppress(RuntimeError):  # the interpreter ends, or the thread pool is already closed
             self._artist.submit(self._free)
         self._artist.shutdown()
 
     def _free(self) -> None:
-        """Free the OpenGL context, on the artist's thread: a picture may just have made it."""
+        """Free the OpenGL context. It runs on the drawing thread, which may just have made it."""
         renderer, self._renderer = self._renderer, None
         if renderer is not None:
             renderer.close()
@@ -112,18 +112,18 @@ class Stream:
                 sender.cancel()
 
     def _drives(self, socket: Any, session: str) -> bool:
-        """Whether this page drives. Of Studio's pages it is the one that Studio has accepted."""
+        """Whether this page drives. Of Studio's pages, the accepted one drives."""
         controller = self._controller()
         return socket is self._first() if controller is None else session == controller
 
     def _controller(self) -> str | None:
-        """The session of the first page of Studio's that it has not refused."""
+        """The session of the first page of Studio's that is not refused."""
         from websockets.protocol import State
 
         return next((session for each, session in self._studio if each.state is State.OPEN), None)
 
     def _first(self) -> Any:
-        """The first page of ours that still asks for pictures."""
+        """The first of our pages that still sends requests."""
         now = time.monotonic()
         return next((each for each, last in self._watching.items() if now - last < SILENT), None)
 
@@ -149,12 +149,12 @@ class Stream:
                 await socket.send(picture)
 
     def _draw(self) -> bytes:
-        """The picture of now as a JPEG, or the last one if it is young. On the artist's thread."""
+        """The current picture as a JPEG, or the last one if it is recent. It runs on the drawing thread."""
         now, moment = time.monotonic(), self._panel.moment
         if moment is not None and now - self._drawn > 0.5 / FPS:
             try:
                 from PIL import Image
-            except ImportError as error:  # on a robot's computer
+            except ImportError as error:  # a robot's computer may lack it
                 raise ViewError(f"its JPEGs are written by Pillow ({error}): pip install pillow") from None
             if self._renderer is None:
                 self._renderer = RobotRenderer(self._robots, WIDTH, HEIGHT, live=True)
@@ -167,9 +167,9 @@ class Stream:
         return self._picture
 
     def _obey(self, message: str | bytes, drives: bool) -> bool:
-        """Do a request of the driving page: a JSON list of a verb and its values. False: there is no such request.
+        """Do a request of the driving page: a JSON list with a verb and its values. False: an unknown request.
 
-        Requests of a page that watches do nothing. What a page may ask is what the panel offers.
+        Requests of other pages have no effect. The allowed requests are those of the panel.
         """
         panel, request = self._panel, _request(message)
         match request:
@@ -181,7 +181,7 @@ class Stream:
                 act = partial(panel.steer, column, value)
             case ["push", float(speed) | int(speed)]:
                 act = partial(panel.set_push, speed)
-            case ["turn", float(x) | int(x), float(y) | int(y)]:  # of the picture's height
+            case ["turn", float(x) | int(x), float(y) | int(y)]:  # fraction of the picture's height
                 act = partial(self._moves.append, (mujoco.mjtMouse.mjMOUSE_ROTATE_V, x, y))
             case ["zoom", float(y) | int(y)]:
                 act = partial(self._moves.append, (mujoco.mjtMouse.mjMOUSE_ZOOM, 0.0, y))
@@ -193,13 +193,13 @@ class Stream:
 
 
 def _step_back() -> None:
-    """Lower the priority of this thread and of those that OpenGL starts from it: the control loop comes first."""
-    if sys.platform == "linux":  # elsewhere it would be the whole process's
+    """Lower the priority of this thread and of OpenGL's threads that it starts: the control loop has priority."""
+    if sys.platform == "linux":  # on other systems this changes the whole process
         os.nice(5)
 
 
 def _request(message: str | bytes) -> list[str | float] | None:
-    """The texts and numbers of a page's message; numbers within +-MOST. None: it is something else."""
+    """The texts and numbers of a page's message; numbers within +-MOST. None for any other message."""
     try:
         request = json.loads(message) if len(message) <= MESSAGE else None
     except ValueError:

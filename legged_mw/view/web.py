@@ -114,7 +114,7 @@ class WebViewer:
         if host == LOCAL and bound[0] != LOCAL:
             self.close()
             raise ViewError(
-                f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise"
+                f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this version of mujoco binds it differently"
             )
 
     def _listens(self) -> bool:
@@ -165,7 +165,7 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
             html = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(PAGE))}
             return Response(200, "OK", Headers({**html, "Cache-Control": "no-store"}), PAGE)
         if not reason and path == "/stream":
-            return None  # go on with the handshake
+            return None  # continue with the handshake
         if not reason:
             response = answer(connection, request)
             whole = path in ("/", "/index.html") and response.status_code == 200
@@ -197,7 +197,7 @@ def free_port(host: str, port: int = 0) -> int:
     """`port` if it is free; for 0 the first free port from FIRST_PORT on. Raises ViewError."""
     if not host:  # an empty host would mean all interfaces
         raise ViewError(
-            f"--host is empty; leave it out for {LOCAL}, this machine alone, or name an interface (0.0.0.0: all)"
+            f"--host is empty; leave it out for {LOCAL} (this machine only), or name an interface (0.0.0.0: all)"
         )
     candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
     for candidate in candidates:
@@ -229,8 +229,8 @@ def tunnel_line(port: int) -> str:
     # SSH_CONNECTION: the client's address and port, then ours as the client sees them
     client = os.environ.get("SSH_CONNECTION", "").split()
     if len(client) == 4:
-        way = f"-p {client[3]} " if client[3] != "22" else ""
-        return f"ssh {way}-L {port}:{LOCAL}:{port} {user}@{client[2]}"
+        port_flag = f"-p {client[3]} " if client[3] != "22" else ""
+        return f"ssh {port_flag}-L {port}:{LOCAL}:{port} {user}@{client[2]}"
     return f"ssh -L {port}:{LOCAL}:{port} {user}@{socket.gethostname()}"
 
 
@@ -303,8 +303,8 @@ class Gate:
 
     def asked(self, target: str) -> str:
         """The token in the query of ``target``."""
-        found = re.search(r"[?&]token=([\w-]*)", target)
-        return found[1] if found else ""
+        match = re.search(r"[?&]token=([\w-]*)", target)
+        return match[1] if match else ""
 
     def greeting(self, target: str) -> dict[str, str]:
         """Headers for a first visit with the right token: set a cookie, drop the token from the address. Else empty."""

@@ -105,7 +105,10 @@ WAYS = {
         spoil_row,
         "observation row 'commands' of 'state' was not finite, or beyond 1e+06, in 1 of 64 steps of a world; 0 took its pla",
     ),
-    "handed out": (spoil_handed_out, "held what is not finite or beyond 1e+06) and is undone: 1 in a row, 1 so far"),
+    "handed out": (
+        spoil_handed_out,
+        "had values that are not finite or beyond 1e+06) and is undone: 1 in a row, 1 so far",
+    ),
 }
 
 

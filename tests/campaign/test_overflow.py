@@ -49,7 +49,7 @@ def test_play_says_it_once(env: LeggedRobot, capsys: pytest.CaptureFixture[str])
     stage = EnvStage(env, still)
     for _ in range(3):
         stage.step(None)
-    assert f"WARNING: what is shown {NOTE}\n" == capsys.readouterr().out
+    assert f"WARNING: the shown simulation {NOTE}\n" == capsys.readouterr().out
 
 
 def test_the_report_says_it(env: LeggedRobot) -> None:

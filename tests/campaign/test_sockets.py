@@ -241,7 +241,7 @@ def test_the_udp_server_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyP
     good = [(0.0, HELLO, CLIENT), (0.1, targets(1), CLIENT), (0.1, targets(2), CLIENT)]
     bad = [(0.1, data, CLIENT)] * 20
     server._socket = FakeSocket([*good, *bad], monkeypatch)
-    assert server.serve(said.append) == "10.0.0.1:5000 fell silent for 0.5 s"
+    assert server.serve(said.append) == "10.0.0.1:5000 sent nothing for 0.5 s"
     assert server._socket.now == pytest.approx(0.7) and len(robot.targets) == 2 and robot.closed
     assert server.dropped[why] == sum(server.dropped.values()) == 4 and f"(4 packets dropped: 4 {why})" in said[-1]
 
@@ -259,7 +259,7 @@ def test_the_udp_server_obeys_one_client_that_it_can_answer(monkeypatch: pytest.
         (0.1, udp.pack(udp.CLOSE, DIGEST, 1), OTHER),
     ]
     server._socket = FakeSocket([*before, *after, *[(0.2, HELLO, CLIENT)] * 9], monkeypatch)
-    assert server.serve(lambda _: None) == "10.0.0.1:5000 fell silent for 0.5 s" and len(robot.targets) == 1
+    assert server.serve(lambda _: None) == "10.0.0.1:5000 sent nothing for 0.5 s" and len(robot.targets) == 1
     assert server.dropped == {
         "before a hello": 2,
         "that cannot be answered": 2,
@@ -304,15 +304,15 @@ def test_a_refusal_paints_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- what no robot measures
 
 ABSURD = [
-    ("no gravity", {"gravity": np.zeros(3)}, "what is measured cannot be: gravity of length 0.00, not 1"),
+    ("no gravity", {"gravity": np.zeros(3)}, "a measured value is impossible: gravity of length 0.00, not 1"),
     ("twice gravity", {"gravity": np.array([0, 0, -2.0])}, "gravity of length 2.00, not 1"),
     ("gravity of 10^30", {"gravity": np.array([0, 0, -1e30])}, "gravity of length 1"),
-    ("gravity is NaN", {"gravity": np.array([0, NAN, -1.0])}, "what is measured is not finite: gravity"),
+    ("gravity is NaN", {"gravity": np.array([0, NAN, -1.0])}, "a measured value is not finite: gravity"),
     ("an angle of 10^30", {"joint_pos": np.full(12, 1e30)}, "joint_pos of 1e+30 rad"),
-    ("an angle of infinity", {"joint_pos": np.full(12, -INF)}, "what is measured is not finite: joint_pos"),
+    ("an angle of infinity", {"joint_pos": np.full(12, -INF)}, "a measured value is not finite: joint_pos"),
     ("a speed of 10^30", {"joint_vel": np.full(12, -1e30)}, "joint_vel of 1e+30 rad/s"),
     ("a turn of 10^30", {"ang_vel": np.array([0, 1e30, 0])}, "ang_vel of 1e+30 rad/s"),
-    ("a turn that is NaN", {"ang_vel": np.array([0, NAN, 0])}, "what is measured is not finite: ang_vel"),
+    ("a turn that is NaN", {"ang_vel": np.array([0, NAN, 0])}, "a measured value is not finite: ang_vel"),
 ]
 
 
@@ -402,9 +402,9 @@ TRIPS = [
     ("no orientation", {"imu_state__quaternion": 0.0}, "gravity of length 0.00, not 1"),
     ("half an orientation", {"imu_state__quaternion": [0.5, 0, 0, 0]}, "gravity of length 0.25, not 1"),
     ("a huge one", {"imu_state__quaternion": [1e19, 0, 0, 0]}, "gravity of length"),
-    ("NaN", {"imu_state__quaternion": NAN}, "what is measured is not finite: gravity"),
+    ("NaN", {"imu_state__quaternion": NAN}, "a measured value is not finite: gravity"),
     ("angles of 10^30", {"motor_state__q": 1e30}, "joint_pos of 1e+30 rad"),
-    ("speeds of infinity", {"motor_state__dq": INF}, "what is measured is not finite: joint_vel"),
+    ("speeds of infinity", {"motor_state__dq": INF}, "a measured value is not finite: joint_vel"),
     ("a gyro of 10^30", {"imu_state__gyroscope": 1e30}, "ang_vel of 1e+30 rad/s"),
     ("a battery that is NaN", {"power_v": NAN}, "the battery has nan V"),
 ]

@@ -1,9 +1,9 @@
-"""Concurrent teacher and student: the policy reads a latent, of a teacher's encoder or of a student's.
+"""Concurrent teacher and student: the policy reads a latent from a teacher's encoder or a student's encoder.
 
-The teacher's encoder reads rows that only the simulator knows, the student's the robot's own observations. Some worlds
-act by the teacher's latent, the others by the student's. PPO trains the policy in all worlds, and the teacher's encoder
-in the teacher's worlds. The student's encoder learns by regression to the teacher's latent, in all worlds. During an
-update the policy reads the student's latent of the rollout. Play and export use the student's path.
+The teacher's encoder reads rows that only the simulator has. The student's encoder reads the robot's observations.
+Some worlds act with the teacher's latent, the others with the student's. PPO trains the policy in all worlds, and the
+teacher's encoder in the teacher's worlds. The student's encoder learns the teacher's latent by regression, in all.
+In an update the policy reads the student's latent from the rollout. Play and export use the student.
 
 Wang et al., "CTS: Concurrent Teacher-Student Reinforcement Learning for Legged Locomotion", RA-L 2024.
 """
@@ -25,12 +25,12 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
 FIELD = "actor.concurrent.groups"
-# its multiples' fractions fill [0, 1) evenly, out of step with terrain columns and any other period
+# golden ratio: the fractions of its multiples fill [0, 1) evenly, with no period in common with terrain columns
 _GOLDEN = 0.6180339887498949
 
 
 class ConcurrentModel(RegressingModel):
-    """Its network reads the newest frames and a latent of unit length; ``estimator`` is the student's encoder."""
+    """A network that reads the newest frames and a latent of length 1. ``estimator`` is the student's encoder."""
 
     field, regression = FIELD, "student"
 
@@ -44,9 +44,9 @@ class ConcurrentModel(RegressingModel):
         concurrent: dict[str, Any],
         **more: Any,
     ) -> None:
-        """``concurrent``: the config section, and ``newest``, (start, stop) of observation columns; then MLPModel's.
+        """``concurrent``: the config section with ``newest``, (start, stop) of observation columns. Then MLPModel's.
 
-        Without ``groups`` it is a student that only acts. ``obs`` must be of all N worlds otherwise.
+        Without ``groups`` it is a student that only acts. Otherwise ``obs`` must have all N worlds.
         """
         self._newest, self._size, self._groups = concurrent["newest"], concurrent["latent_dim"], concurrent["groups"]
         self.learning_rate = concurrent["learning_rate"]
@@ -62,13 +62,13 @@ class ConcurrentModel(RegressingModel):
                 "teacher_worlds", pick_teacher_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False
             )
 
-    teacher_worlds: Tensor  # (N, 1): the worlds that act by the teacher's latent
+    teacher_worlds: Tensor  # (N, 1): True for worlds that act with the teacher's latent
 
     def _get_latent_dim(self) -> int:
         return sum(stop - start for start, stop in self._newest) + self._size
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """The network's input (B, newest + E) with the student's latent, which has no gradient."""
+        """The network's input (B, newest + E) with the student's latent, without gradient."""
         seen = super().get_latent(obs, masks, hidden_state)
         with torch.no_grad():
             return join(seen, self._newest, self.estimator(seen))
@@ -78,16 +78,16 @@ class ConcurrentModel(RegressingModel):
 
     @torch.no_grad()
     def regression_batch(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """The encoders' inputs (B, ...), padded to a multiple of four columns, and whether the teacher acted (B, 1)."""
+        """The encoders' inputs (B, ...), padded to a multiple of four columns; true where the teacher acted (B, 1)."""
         seen, known = MLPModel.get_latent(self, obs), self.teacher[0](self._known(obs))
         by_teacher = self.teacher_worlds.index_select(0, worlds).repeat(len(seen) // len(worlds), 1)
         return *(nn.functional.pad(each, (0, -each.shape[1] % 4)) for each in (seen, known)), by_teacher
 
     def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         seen, known, by_teacher = regression_batch
-        wanted = run_mlp(self.teacher[1], known)
-        output = run_mlp(self.mlp, self._take_over(latent, wanted, by_teacher))
-        return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
+        target = run_mlp(self.teacher[1], known)
+        output = run_mlp(self.mlp, self._take_over(latent, target, by_teacher))
+        return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(target).detach())
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         if isinstance(normalizer := self.teacher[0], EmpiricalNormalization):
@@ -113,7 +113,7 @@ class ConcurrentModel(RegressingModel):
 
 
 class _OnnxStudent(nn.Module):
-    """Observations (B, size) in their units -> mean actions (B, A), by the student's latent."""
+    """Observations (B, size) in their units -> mean actions (B, A), with the student's latent."""
 
     def __init__(self, model: ConcurrentModel) -> None:
         super().__init__()
@@ -130,24 +130,24 @@ class _OnnxStudent(nn.Module):
 
 
 def join(seen: Tensor, newest: list[tuple[int, int]], encoded: Tensor) -> Tensor:
-    """The ``newest`` columns of the observations, and the latent beside them."""
+    """Concatenate the ``newest`` columns of the observations and the latent."""
     return torch.cat([*(seen[:, start:stop] for start, stop in newest), unit(encoded)], dim=-1)
 
 
 def unit(x: Tensor) -> Tensor:
-    """Vectors (B, E) of length 1."""
+    """Normalise vectors (B, E) to length 1."""
     return nn.functional.normalize(x, dim=-1)
 
 
 def pick_teacher_worlds(worlds: int, share: float) -> Tensor:
-    """The worlds that act by the teacher's latent (N, 1), the same in each run. Neighbours include both kinds."""
+    """(N, 1) True for worlds that act with the teacher's latent, equal in each run. Neighbours include both kinds."""
     return ((torch.arange(worlds, dtype=torch.float64) * _GOLDEN) % 1.0 < share)[:, None]
 
 
 def concurrent_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-    """Section ``actor.concurrent`` of the learner's ``sections`` as ConcurrentModel takes it. Raises ConfigError.
+    """Section ``actor.concurrent`` of the learner's ``sections`` in the form of ConcurrentModel. Raises ConfigError.
 
-    ``learns``: False for a student that only acts, and needs no teacher.
+    ``learns``: False for a student that only acts and needs no teacher.
     """
     concurrent, read = sections["actor"]["concurrent"], sections["obs_groups"]["actor"]
     groups = concurrent["groups"] if learns else []

@@ -1,6 +1,6 @@
-"""rsl-rl's Distillation recorded as CUDA graphs: the same keys, mathematics and checkpoints, no read from the device.
+"""rsl-rl's Distillation recorded as CUDA graphs: the same config keys, mathematics, checkpoints; no device reads.
 
-A student learns to act like a teacher that sees more, in the states that the student's own actions lead to (DAgger).
+A student learns the actions of a teacher with more observations, in the states that the student visits (DAgger).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from legged_mw.sim.graph import StepGraph
 
 
 class GraphedDistillation(Recorded, Distillation):
-    """Distillation whose acting and update are replayed CUDA graphs.
+    """Distillation with acting and update as replayed CUDA graphs.
 
-    What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer
-    other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. On
-    a CPU nothing is recorded.
+    In these cases rsl-rl's own code runs and a message says so: a network other than a plain MLPModel or RNNModel,
+    mixed precision, an optimizer other than Adam or AdamW, a distribution that is not Gaussian. On a CPU nothing is
+    recorded.
     """
 
     def __init__(self, student: MLPModel, teacher: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
@@ -42,7 +42,7 @@ class GraphedDistillation(Recorded, Distillation):
         self._obs = TensorDict(
             {name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device
         )
-        # the student learns from its own groups alone
+        # the student learns from its own groups only
         storage.observations = storage.observations.select(*student.obs_groups)
         self._loss = torch.zeros((), device=self.device)
         self.rollback = UpdateRollback(self, (self.student,))
@@ -53,18 +53,18 @@ class GraphedDistillation(Recorded, Distillation):
         if self.storage.num_transitions_per_env % self.gradient_length:
             steps = self.storage.num_transitions_per_env
             return f"gradient_length {self.gradient_length} does not divide a rollout of {steps} steps"
-        # a teacher may have an estimator: it does not learn
+        # a teacher may have an estimator, because it does not learn
         return why_stock(self, self.student, self.teacher, regressing=self.teacher)
 
     def _begin(self) -> None:
-        """Make empty memories, and graphs to be recorded at their next calls."""
+        """Make empty memories, and graphs that the next calls record."""
         self._memories = Memories((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
         self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
 
     # ---- the rollout ----------------------------------------------------------------------------------------------
 
     def act(self, obs: TensorDict) -> Tensor:
-        """The student's sampled actions (N, A); the transition keeps the teacher's until ``process_env_step``."""
+        """The student's sampled actions (N, A). The transition holds the teacher's until ``process_env_step``."""
         if not self.graphed:
             return super().act(obs)
         if self.storage.step == 0:
@@ -77,11 +77,11 @@ class GraphedDistillation(Recorded, Distillation):
 
     def _act(self) -> None:
         actions = sample(self.student, self.student.mlp(self._latent(self.student)))
-        wanted = self._mean(self.teacher, self._latent(self.teacher))
-        self._acted = actions.detach(), wanted.detach()
+        target = self._mean(self.teacher, self._latent(self.teacher))
+        self._acted = actions.detach(), target.detach()
 
     def _latent(self, model: MLPModel) -> Tensor:
-        """The input of a network's MLP. A memory takes in the observations."""
+        """The input of the network's MLP. It updates a memory with the observations."""
         return self._memories[model].advance(self._obs) if model in self._memories else model.get_latent(self._obs)
 
     def _mean(self, model: MLPModel, latent: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ class GraphedDistillation(Recorded, Distillation):
     # ---- the update -----------------------------------------------------------------------------------------------
 
     def update(self) -> dict[str, Any]:
-        """Learn from the storage, step by step; returns the mean loss as a tensor ()."""
+        """Learn from the storage step by step. Returns the mean loss as a tensor ()."""
         if not self.graphed:
             return super().update()
         self.num_updates += 1
@@ -115,12 +115,12 @@ class GraphedDistillation(Recorded, Distillation):
         self._loss.zero_()
         for _ in range(self.num_learning_epochs):
             state = memory.start[:, 0] if memory else None
-            for inputs, wanted, ended in chunks:
+            for inputs, targets, ended in chunks:
                 latent, state = self._unroll(inputs, ended, state)
-                self._gradient_step(latent, wanted.flatten(0, 1))
+                self._gradient_step(latent, targets.flatten(0, 1))
         self._loss /= self.num_learning_epochs * len(chunks)
         if memory and state is not None:
-            memory.now[:, 0].copy_(state)  # as in rsl-rl: of the updated student
+            memory.now[:, 0].copy_(state)  # of the updated student, as in rsl-rl
         if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
             with torch.no_grad():
                 update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
@@ -134,7 +134,7 @@ class GraphedDistillation(Recorded, Distillation):
         if state is None or not isinstance(self.student, RNNModel):
             return nn.functional.pad(
                 inputs.flatten(0, 1), (0, -inputs.shape[2] % 4)
-            ), None  # TF32 products want a multiple of 4
+            ), None  # TF32 products are faster with a multiple of 4
         seen = []
         for x, over in zip(inputs, ended, strict=True):
             latent, state = step(self.student.rnn.rnn, x, state)
@@ -142,9 +142,9 @@ class GraphedDistillation(Recorded, Distillation):
             state = state.masked_fill(over, 0.0)
         return torch.cat(seen), state.detach()
 
-    def _gradient_step(self, latent: Tensor, wanted: Tensor) -> None:
-        """One step towards ``wanted`` (B, A); the loss is a sum over steps of their means, as in rsl-rl."""
-        loss = self.loss_fn(self._mean(self.student, latent), wanted)
+    def _gradient_step(self, latent: Tensor, target: Tensor) -> None:
+        """One step towards the actions ``wanted`` (B, A). The loss is a sum of each step's mean, as in rsl-rl."""
+        loss = self.loss_fn(self._mean(self.student, latent), target)
         self.optimizer.zero_grad()
         (loss * self.gradient_length).backward()
         if self.is_multi_gpu:

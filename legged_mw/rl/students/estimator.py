@@ -1,8 +1,8 @@
-"""An actor that reads its own estimate of what a robot cannot measure, and the regression that trains the estimator.
+"""An actor that reads its own estimate of values that a robot cannot measure, trained by regression.
 
-The estimator goes from the actor's observations to rows that only the simulator knows. The policy reads the estimate
-beside its observations, but no gradient of the policy reaches the estimator, and none of the estimator the policy.
-During an update the policy reads the estimate that it acted with; the estimator learns beside it.
+The estimator maps the actor's observations to rows that only the simulator has. The policy reads the observations and
+the estimate. No gradient of the policy reaches the estimator, and no gradient of the estimator reaches the policy.
+In an update the policy reads the estimate from the rollout, and the estimator learns in parallel.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from legged_mw.rl.policies import ESTIMATE
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-SMALLEST = 0.01  # smallest standard deviation of a target, in its unit, as rsl-rl's eps for observations
+SMALLEST = 0.01  # smallest standard deviation of a target, in its unit, like rsl-rl's eps for observations
 FIELD = "actor.estimator.targets"
 
 
 class Target(NamedTuple):
-    """A row that is estimated, and where an observation group holds it."""
+    """A row to estimate, and its place in an observation group."""
 
     name: str
     group: str
@@ -36,7 +36,7 @@ class Target(NamedTuple):
 
 
 class TargetNormalizer(EmpiricalNormalization):
-    """A normaliser without eps: an export holds its standard deviation unchanged."""
+    """A normaliser without eps, so that an export has the exact standard deviation."""
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - self._mean) / self._std.clamp(min=SMALLEST)
@@ -46,7 +46,7 @@ class TargetNormalizer(EmpiricalNormalization):
 
 
 class EstimatingModel(RegressingModel):
-    """Its network reads normalised observations and, beside them, the normalised estimate of E values."""
+    """A network that reads normalised observations and the normalised estimate of E values."""
 
     field, regression = FIELD, "estimate"
 
@@ -60,7 +60,7 @@ class EstimatingModel(RegressingModel):
         estimator: dict[str, Any],
         **more: Any,
     ) -> None:
-        """``estimator``: the config section, its ``targets`` as ``Target``s; the rest is MLPModel's."""
+        """``estimator``: the config section with ``targets``, a list of ``Target``. Others: see MLPModel."""
         targets = [Target(*target) for target in estimator["targets"]]
         scales = [scale for target in targets for scale in target.scale]
         self._targets, self._size, self.learning_rate = targets, len(scales), estimator["learning_rate"]
@@ -75,7 +75,7 @@ class EstimatingModel(RegressingModel):
         return self.obs_dim + self._size
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
-        """The network's input (B, obs + E); the estimate has no gradient."""
+        """The network's input (B, obs + E). The estimate has no gradient."""
         seen = super().get_latent(obs, masks, hidden_state)
         with torch.no_grad():
             estimate = self.estimator(seen)
@@ -87,14 +87,14 @@ class EstimatingModel(RegressingModel):
         return (self.target_normalizer(self.truth(obs)),)
 
     def learn(self, latent: Tensor, regression_batch: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """The estimator reads the first columns of ``latent``, the observations."""
+        """Run network and estimator. The estimator reads the first columns of ``latent``, the observations."""
         return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), regression_batch[0])
 
     def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         update_normalizer(self.target_normalizer, self.truth(obs), ranks)
 
     def truth(self, obs: TensorDict) -> Tensor:
-        """The targets (B, E) in their units, as the groups of ``obs`` hold them."""
+        """The targets (B, E) in their units, from the groups of ``obs``."""
         parts = [obs[each.group][:, each.start : each.start + len(each.scale)] for each in self._targets]
         return torch.cat(parts, dim=1) / self._scales
 
@@ -103,7 +103,7 @@ class EstimatingModel(RegressingModel):
         return self.target_normalizer.inverse(self.estimator(super().get_latent(obs)))
 
     def columns_of(self, row: str) -> slice | None:
-        """Columns of a row in the estimate; None if it is not estimated."""
+        """Columns of a row in the estimate; None if it has no such row."""
         start = 0
         for target in self._targets:
             if target.name == row:
@@ -120,7 +120,7 @@ class EstimatingModel(RegressingModel):
 
 
 def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
-    """vx, vy (N, 2) [m/s] as ``policy`` estimates them; None if it does not."""
+    """The estimated vx, vy (N, 2) [m/s] of ``policy``; None without an estimator."""
     columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None
     return None if columns is None else policy.estimate(obs)[:, columns][:, :2]
 
@@ -128,7 +128,7 @@ def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
 class _OnnxEstimatingModel(nn.Module):
     """Observations (B, size) in their units -> mean actions (B, A), and the estimate (B, E) in the targets' units."""
 
-    outputs = [ESTIMATE]  # beside the actions
+    outputs = [ESTIMATE]  # additional to the actions
 
     def __init__(self, model: EstimatingModel) -> None:
         super().__init__()
@@ -149,9 +149,9 @@ class _OnnxEstimatingModel(nn.Module):
 
 
 def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-    """Section ``actor.estimator`` of the learner's ``sections`` as EstimatingModel takes it. Raises ConfigError.
+    """Section ``actor.estimator`` of the learner's ``sections`` in the form of EstimatingModel. Raises ConfigError.
 
-    ``learns``: False for an actor that only acts, in worlds that may be without what ``domain_rand`` showed the critic.
+    ``learns``: False for an actor that only acts, in worlds that may lack rows of ``domain_rand`` for the critic.
     """
     return {
         **sections["actor"]["estimator"],
@@ -160,7 +160,7 @@ def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -
 
 
 def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:
-    """Each target and its row, from the critic's groups, then others, none that the actor reads. Raises ConfigError."""
+    """Each target and its row, from the critic's groups first; no row that the actor reads. Raises ConfigError."""
     names, obs_groups, groups = (
         sections["actor"]["estimator"]["targets"],
         sections["obs_groups"],
@@ -172,10 +172,10 @@ def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) 
         if group in groups and group not in obs_groups["actor"]
     ]
     rows = {row.name: (group, row) for group in reversed(order) for row in groups[group] if not row.group}
-    found = []
+    targets = []
     for i, name in enumerate(names):
         if name not in rows and not learns and (width := env.domain_rand.widths.get(name)):
-            found.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
+            targets.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
             continue
         if name not in rows:
             hint = (
@@ -186,5 +186,5 @@ def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) 
         if name in names[:i]:
             raise ConfigError(f"{FIELD} names '{name}' twice")
         group, row = rows[name]
-        found.append((Target(name, group, env.observations.newest(group, name).start, row.column_scales()), row))
-    return found
+        targets.append((Target(name, group, env.observations.newest(group, name).start, row.column_scales()), row))
+    return targets

@@ -1,9 +1,9 @@
-"""GRU and LSTM networks in a recorded rollout and update, and the hidden state of a policy wherever it acts.
+"""GRU and LSTM networks in a recorded rollout and update, and the hidden state of a policy.
 
-rsl-rl cuts a rollout into episodes and pads them to one length: a shape that depends on data. Here the network runs
-over the T steps of the rollout with all worlds side by side, and the state of a world becomes 0 before the step that
-begins an episode: the same values and gradients. cuDNN cannot change a state on the way, so each step is a product and
-a few kernels of its own.
+rsl-rl splits a rollout into episodes and pads them to one length, so shapes depend on data. Here the network runs over
+the T steps of the rollout for all worlds in parallel, and the state of a world is set to 0 before the first step of an
+episode. Values and gradients are the same. cuDNN cannot change a state between steps, so each step is a matrix product
+and a few other kernels.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ class SequenceInput(NamedTuple):
 
     inputs: Tensor  # (S, T, B, size), normalised
     state: Tensor  # (states, S, B, H), at the first step
-    keep: Tensor  # (T, B, 1): 0 where an episode begins, else 1
+    keep: Tensor  # (T, B, 1): 0 at the first step of an episode, else 1
 
 
 class HiddenState:
-    """The state of a recurrent network in each of N worlds, in tensors that stay.
+    """The state of a recurrent network in each of N worlds, in fixed tensors.
 
-    With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has
-    no mirror image of its own.
+    With ``images`` 2 there is a second state, updated with mirror images only, because the mirror image of a learned
+    state is unknown.
     """
 
     def __init__(self, model: RNNModel, worlds: int, images: int, device: str) -> None:
         self._model = model
         self.now = torch.zeros(states_of(model)[0], images, worlds, states_of(model)[1], device=device)
-        self.start = torch.zeros_like(self.now)  # when the rollout began
+        self.start = torch.zeros_like(self.now)  # at the start of the rollout
 
     def advance(self, obs: Any) -> Tensor:
-        """Take in observations (N,), or (2N,) with their mirror images; returns the MLP's input (N, H)."""
+        """Update with observations (N,), or (2N,) with mirror images. Returns the MLP's input (N, H)."""
         seen, after = step(self._model.rnn.rnn, self.normalised(obs), self.now.flatten(1, 2))
         self.now.copy_(after.view_as(self.now))
         return seen[: self.now.shape[2]]
@@ -73,7 +73,7 @@ class HiddenState:
 
 
 class RecurrentModel(RememberingModel):
-    """rsl-rl's RNNModel, with a memory for recorded learners, and an export with the state as input and output."""
+    """rsl-rl's RNNModel with a memory for recorded learners. An export has the state as input and output."""
 
     def memory(self, worlds: int, images: int, device: str) -> HiddenState:
         return HiddenState(self, worlds, images, device)
@@ -85,7 +85,7 @@ class RecurrentModel(RememberingModel):
 class _OnnxRecurrentModel(nn.Module):
     """Observations (B, size) in their units and states (B, states, H) -> mean actions (B, A) and the next states."""
 
-    outputs = [MEMORY_OUTPUT]  # beside the actions
+    outputs = [MEMORY_OUTPUT]  # additional to the actions
 
     def __init__(self, model: RecurrentModel) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class _OnnxRecurrentModel(nn.Module):
 
 
 def memory_of(policy: MLPModel, worlds: int) -> Tensor:
-    """The hidden state of an rsl-rl network (N, states, H), zeros at first; (N, 0, 0) without a memory."""
+    """Zero hidden states of an rsl-rl network (N, states, H); (N, 0, 0) without a memory."""
     held = policy.get_hidden_state()
     if held is None:
         return torch.zeros(worlds, *(states_of(policy) if isinstance(policy, RNNModel) else (0, 0)))
@@ -114,14 +114,14 @@ def states_of(model: RNNModel) -> tuple[int, int]:
 
 
 def forget(policy: Any, ended: Tensor | None = None) -> None:
-    """Clear the hidden state where ``ended`` (N,), or everywhere; a policy without a memory is left alone."""
+    """Clear the hidden state where ``ended`` (N,), or everywhere. No effect on a policy without a memory."""
     if getattr(policy, "is_recurrent", False):
-        with torch.inference_mode():  # its state may have been made there
+        with torch.inference_mode():  # the state may be an inference tensor
             policy.reset(ended)
 
 
 def with_own_state(policy: Any) -> Any:
-    """A copy of the policy with a hidden state of its own; the policy itself if it has no memory."""
+    """A copy of the policy with a separate hidden state; the policy itself without a memory."""
     if not getattr(policy, "is_recurrent", False):
         return policy
     return copy.deepcopy(policy).apply(lambda part: part.flatten_parameters() if isinstance(part, nn.RNNBase) else None)
@@ -150,9 +150,9 @@ def unroll(rnn: nn.RNNBase, sequence: SequenceInput) -> Tensor:
     return x.flatten(0, 2)
 
 
-# The two layers below take the inputs' part of the gates, (S, T, B, gates * H), as in torch, and run the rest, the
-# state's part, step by step. In the backward pass the gradient of every gate is that of h (or c) times a factor: all
-# factors are made at once.
+# These layers take the inputs' part of the gates, (S, T, B, gates * H), as in torch, and compute the state's part
+# step by step. In the backward pass the gradient of each gate is the gradient of h (or c) times a factor. All factors
+# are computed at once.
 
 
 class GRU(torch.autograd.Function):
@@ -185,7 +185,7 @@ class GRU(torch.autograd.Function):
         of_h = torch.empty_like(before)
         of_h[-1] = grad[:, -1]
         for t in reversed(range(len(keep))):
-            into[t].unflatten(-1, (3, size)).mul_(of_h[t].unsqueeze(-2))  # from here on a gradient
+            into[t].unflatten(-1, (3, size)).mul_(of_h[t].unsqueeze(-2))  # now the gradient
             if t:
                 back = (into[t].flatten(0, 1) @ weight).view_as(of_h[t]).addcmul_(of_h[t], z[t])
                 torch.addcmul(grad[:, t - 1], back, keep[t], out=of_h[t - 1])
@@ -224,10 +224,10 @@ class LSTM(torch.autograd.Function):
         to_cell, onward = o * (1.0 - squashed.square()), f * keep.unsqueeze(1)
         factors = [g * i * (1.0 - i), cell * f * (1.0 - f), i * (1.0 - g.square()), squashed * o * (1.0 - o)]
         into = torch.cat(factors, dim=-1)
-        of_h, of_c = grad[:, -1], torch.zeros_like(cell[0])  # of c only what comes from the step after
+        of_h, of_c = grad[:, -1], torch.zeros_like(cell[0])  # gradient of c from the next step only
         for t in reversed(range(len(keep))):
             of_c = torch.addcmul(of_c, of_h, to_cell[t])
-            into[t, ..., : 3 * size].unflatten(-1, (3, size)).mul_(of_c.unsqueeze(-2))  # from here on a gradient
+            into[t, ..., : 3 * size].unflatten(-1, (3, size)).mul_(of_c.unsqueeze(-2))  # now the gradient
             into[t, ..., 3 * size :].mul_(of_h)
             if t:
                 of_c = of_c * onward[t]
