@@ -236,7 +236,7 @@ def _root_motion(
 ) -> tuple[Floats, Floats]:
     """(T, 6) acceleration of the root without gravity, starting level; (3,) its angular velocity at the start.
 
-    ``gyro`` and ``felt`` (T, 3): gyro and accelerometer, IMU frame. Linear: world frame. Angular: body frame.
+    ``gyro`` and ``acceleration`` (T, 3): of the IMU, its frame. Linear: world frame. Angular: body frame.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
