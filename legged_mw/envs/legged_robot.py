@@ -146,7 +146,7 @@ class LeggedRobot(RobotTask):
             self._update_command_curriculum(mask)
 
     def _share_survived(self) -> Tensor:
-        """(N,) The share of the episode without a fall: 1 if the robot left the terrain, which is not a fall."""
+        """(N,) Length of the episode, as a share of the longest, also if the robot left the terrain."""
         share = self.episode_steps[:, 0] / self.max_episode_length
         return torch.where(self.walked_off, share, super()._share_survived())
 

@@ -63,7 +63,10 @@ def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
 
 
 def _contacts(model: mujoco.MjModel, geom: int, terrain: bool) -> int:
-    """The most contacts of ``geom`` with the ground. On terrain: two for a sphere, else one per probe of one side."""
+    """The most contacts of ``geom`` with the ground.
+
+    On terrain: two for a sphere; one per probe of a row, and one more; else one per probe of one side.
+    """
     kind = _TYPE(model.geom_type[geom])
     plane = _ON_PLANE.get(kind, 4)
     if not terrain:
