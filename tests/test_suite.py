@@ -36,7 +36,10 @@ from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 # the numbers or the robot of others: built in test_skills, or shipped and tested in test_shipped
-VARIANTS = {"go2_getup", "go1_footstand", "go2_handstand", "go2_footstand", "go1_flat_dr", "go2_rough_scan", "g1_rough"}
+VARIANTS = {
+    *("go2_getup", "g1_getup", "go1_footstand", "go2_handstand", "go2_footstand"),
+    *("go1_flat_dr", "go1_rough", "go2_rough_scan", "g1_rough"),
+}
 EXAMPLES = [str(path) for path in sorted(ROOT.glob("examples/*.py")) if "TASK = " in path.read_text()]
 N = 10  # no other tensor has as many rows, so that a first dimension of 10 means worlds
 TINY = {  # of a task on rough ground, and of one that begins in falls

@@ -230,7 +230,9 @@ def _modules(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, .
 
 def _take_out(names: set[str]) -> dict[str, ModuleType]:
     """Remove the modules called ``names`` and their submodules from ``sys.modules``, and return them."""
-    return {name: sys.modules.pop(name) for name in [*sys.modules] if _top(name) in names}
+    if not names:
+        return {}
+    return {name: sys.modules.pop(name) for name in [*sys.modules] if name.partition(".")[0] in names}
 
 
 def _top(name: str) -> str:
