@@ -321,7 +321,7 @@ def test_a_mistake_in_a_real_process(tmp_path: Path) -> None:
     )
 
 
-def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
+def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its MJCF is found beside it, from wherever it is started; the run plays from its saved config."""
     home = tmp_path / "my dog"
     (home / "robot").mkdir(parents=True)
@@ -330,9 +330,9 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     assert 'mass="5.204"' in mjcf
     (home / "robot/dog.xml").write_text(mjcf.replace('mass="5.204"', 'mass="4.5"'))
     common = ["--device", "cpu", "--experiment_name", "my dogs"]
-    result = start(
-        "train", tmp_path, "--task", "my dog/dog.py", *common, "--num_envs", "8", "--max_iterations", "1", "--verbose"
-    )
+    monkeypatch.chdir(tmp_path)
+    small = ["--num_envs", "8", "--max_iterations", "1", "--verbose", "--set", "runner.export=false"]
+    result = run("train", tmp_path, "--task", "my dog/dog.py", *common, *small)
     assert result.code == 0, result.err
     assert "Learning iteration 1/1" in result.out and "rew_calm" in result.out
     [folder] = (tmp_path / "logs/my dogs").iterdir()
@@ -340,6 +340,7 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     assert config["asset"]["file"] == "robot/dog.xml" and config["task"] == "my dog/dog.py"
     video = tmp_path / "dog.mp4"
     elsewhere = ["--video", str(video), "--time", "0.1s", "--set", "viewer.width=160", "--set", "viewer.height=120"]
+    monkeypatch.chdir(ROOT)
     result = run("play", tmp_path, "--task", str(home / "dog.py"), *common, *elsewhere)
     assert result.code == 0, result.err
     assert result.out.startswith(f"task: {home}/dog.py\npolicy: {folder}/model_1.pt\n") and video.stat().st_size > 0

@@ -1,4 +1,4 @@
-"""Six robots as vendors write them, from the unedited file to a deployed policy: check, a short training, export, deploy."""
+"""Robots as vendors write them, from the unedited file to a deployed policy: check, a short training, export, deploy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_they_are_six_short_files() -> None:
 @pytest.mark.parametrize(
     ("name", "engine", "device"),
     [
-        *((name, "mujoco", "cpu") for name in TASKS),
+        *((name, "mujoco", "cpu") for name in ("go2_style", "anymal_c_style", "g1_held_style")),
         ("t1_style", "mujoco_warp", "cpu"),
         *(pytest.param(name, "mujoco_warp", "cuda:0", marks=pytest.mark.gpu) for name in TASKS),
     ],
