@@ -232,7 +232,7 @@ def _take_out(names: set[str]) -> dict[str, ModuleType]:
     """Remove the modules called ``names`` and their submodules from ``sys.modules``, and return them."""
     if not names:
         return {}
-    return {name: sys.modules.pop(name) for name in [*sys.modules] if name.partition(".")[0] in names}
+    return {name: sys.modules.pop(name) for name in [*sys.modules] if _top(name) in names}
 
 
 def _top(name: str) -> str:

@@ -1,7 +1,7 @@
 """The web page: MuJoCo Studio's web viewer with our panel, and our page of pictures. It loads nothing from the internet.
 
 The page is not encrypted, so by default it is bound to 127.0.0.1; use `ssh -L` to reach it from another machine.
-`Gate` controls the access. Undocumented parts of Studio are used only in `_bound_to` and `close`, and checked there.
+`Gate` controls the access. Undocumented parts of Studio are used in `_bound_to` and `_wait` only.
 """
 
 from __future__ import annotations
