@@ -218,6 +218,37 @@ class UprightBipedCfgPPO(BipedCfgPPO):
         desired_kl = 0.0  # [ours: not annealed; if it shrinks, the learning rate falls to 1e-5]
 
 
+class LevelBipedCfg(UprightBipedCfg):
+    """A biped of a G1's size that walks upright with a level trunk and feet under its hips.
+
+    Numbers without a source: [ours: docs/archive/go2_and_g1.md, a level trunk].
+    """
+
+    class rewards(UprightBipedCfg.rewards):
+        swing_height = 0.1  # [m]
+
+        class scales(UprightBipedCfg.rewards.scales):
+            orientation = -15.0  # with -5, a sway of 13 degrees costs less than a tenth of what feet_phase pays
+            ang_vel_xy = -0.2
+            joint_deviation = -3.0  # of waist and hips, which otherwise sway with each step
+            feet_impact_vel = -1.0
+            energy = -0.002  # of a G1
+
+    class perturbation(UprightBipedCfg.perturbation):
+        velocity = [0.0, 8.0]  # [m/s] with 6, 0.62 of pushes of 2 m/s are survived, not all
+        push_interval_s, max_push_vel_xy = 2.5, 0.8  # [s], [m/s]
+
+
+class LevelBipedCfgPPO(UprightBipedCfgPPO):
+    """The learner's config of a level biped."""
+
+    class algorithm(UprightBipedCfgPPO.algorithm):
+        entropy_coef = 0.002  # [ours: the std falls below 0.3]
+
+    class anneal(UprightBipedCfgPPO.anneal):
+        entropy_coef = 0.0001
+
+
 class BipedRoughCfg(BipedCfg):
     """A biped of a G1's size on rough ground, without a height scan."""
 

@@ -54,6 +54,19 @@ class WalkingG1(G1, LeggedRobotCfg):
         peer = "g1"
 
 
+class UprightG1(WalkingG1):
+    class control(WalkingG1.control):  # [U: unitree_rl_lab] [M]'s waist has 28.5, of which the torso's weight takes 22
+        stiffness = {**WalkingG1.control.stiffness, "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]
+        damping = {**WalkingG1.control.damping, "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]
+        action_scale = {**WalkingG1.control.action_scale, "waist": 0.1, "waist_yaw": 0.1}  # [rad] [ours]
+
+    class rewards(WalkingG1.rewards):
+        min_feet_distance = 0.2  # [m]
+        pose_weights = {"": 3.4, "hip_pitch": 0.14, "knee": 0.14, "hip_roll": 1.5, "hip_yaw": 1.5,  # [M]
+                        "ankle_pitch": 1.5, "waist_yaw": 1.5, "shoulder_pitch": 1.5}  # fmt: skip
+        deviation_weights = {"": 0.0, "waist": 1.0, "waist_yaw": 0.2, "hip_roll": 0.2, "hip_yaw": 0.2}  # [ours]
+
+
 class TrackedG1(G1, MotionTrackingCfg):
     class asset(G1.asset):
         colliders = ["*_foot?_collision"]  # all seven capsules of a sole [ours: it stands on one foot]
