@@ -23,6 +23,7 @@ from legged_mw.envs.snapshot import put_snapshot, take_snapshot
 
 KEPT = Path(__file__).parent / "net" / "first_steps.npz"
 TOLERANCES = {"": 0.0, "obs": 1e-5, "reward": 1e-5, "statistics": 1e-4}
+BY_NETWORK = {**TOLERANCES, "obs": 1e-4}  # torques of a network part by 5e-5 between two kinds of CPU
 
 
 @cache
@@ -34,7 +35,9 @@ def kept() -> Found:
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_first_steps_are_as_they_were(name: str, engine: str) -> None:
     run = f"{name} {engine}"
-    lines, failed = differences({run: kept()[run]}, {run: first_steps(name, engine)}, TOLERANCES)
+    lines, failed = differences(
+        {run: kept()[run]}, {run: first_steps(name, engine)}, BY_NETWORK if name == "network" else TOLERANCES
+    )
     assert not failed, "A: kept, B: now\n" + "\n".join(lines)
 
 
