@@ -205,16 +205,22 @@ def _learner(found: Draft, train: str) -> list[str]:
                 "            init_std = 0.6  # at 1.0 it does not learn to follow on a few cores [ours: docs/lab.md]"
             ]
         return lines
-    off = '"domain_rand.enable": False, "perturbation.push": False'
     lines = [f"    class cpu({train}.cpu):  # on a CPU worlds are alike and nobody pushes"]
-    lines += [
-        "        overrides = {",
-        '            "commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',
-    ]
-    lines.append(f"            {off},")
     if len(found.feet) == 2:
-        lines.append('            "actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0],')
-    return [*lines, "        }"]
+        overrides = [
+            '"commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',
+            '"domain_rand.enable": False, "perturbation.push": False,',
+            '"actor.distribution_cfg.init_std": 0.6, "perturbation.velocity": [0.0, 4.0],',
+        ]
+    else:  # as configs/go1_flat.py [ours: docs/archive/drafts.md]
+        lines += ["        desired_kl, max_iterations = 0.03, 1500"]
+        overrides = [
+            '"domain_rand.enable": False, "perturbation.push": False, "commands.end_probability": 0.0,',
+            '"commands.keep_probability": [0.6, 0.25, 0.75], "perturbation.growth": [0.15, 0.4],',
+            '"rewards.tracking_sigma": 0.35, "rewards.tracking_sigma_end": 0.15,',
+            '"rewards.scales.tracking_ang_vel": 1.5, "algorithm.entropy_coef": 0.01,',
+        ]
+    return [*lines, "        overrides = {", *(f"            {line}" for line in overrides), "        }"]
 
 
 def _before_a_real_robot(found: Draft) -> str:
