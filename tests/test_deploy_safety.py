@@ -337,7 +337,10 @@ def test_shipped_policies_trip_nothing(name: str) -> None:
     exam, names = contract_rules(contract), [command.name for command in contract.commands]
     directions = np.arange(walking.PUSH_DIRECTIONS) * 2 * math.pi / walking.PUSH_DIRECTIONS
     kicks = [
-        speed * np.array([math.cos(a), math.sin(a)]) for speed in exam.push_speeds if speed <= exam.push_mark for a in directions
+        speed * np.array([math.cos(a), math.sin(a)])
+        for speed in exam.push_speeds
+        if speed <= exam.push_mark
+        for a in directions
     ]
     held = exam.held()
     wanted = np.tile([command.default for command in contract.commands], (len(held) + len(kicks), 1))
