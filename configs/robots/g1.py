@@ -1,6 +1,7 @@
 """Unitree G1, a humanoid of 29 joints: for any task, walking, tracking. Masses, motors and ranges are in g1.xml.
 
-Sources: [U] unitree_rl_gym; [M] mjlab: gains from rotor inertia, 10 Hz, damping ratio 2; [B] BeyondMimic; [ours].
+Sources: [U] unitree_rl_gym; [UL] unitree_rl_lab; [M] mjlab: gains from rotor inertia, 10 Hz, damping ratio
+2; [B] BeyondMimic; [ours].
 """
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
@@ -55,10 +56,11 @@ class WalkingG1(G1, LeggedRobotCfg):
 
 
 class UprightG1(WalkingG1):
-    class control(WalkingG1.control):  # [U: unitree_rl_lab] [M]'s waist has 28.5, of which the torso's weight takes 22
+    class control(WalkingG1.control):  # [UL]; of [M]'s 28.5 in roll and pitch the torso's weight takes 22 [ours]
         stiffness = {**WalkingG1.control.stiffness, "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]
         damping = {**WalkingG1.control.damping, "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]
-        action_scale = {**WalkingG1.control.action_scale, "waist": 0.1, "waist_yaw": 0.1}  # [rad] [ours]
+        action_scale = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "hip_roll": 0.35,  # [rad]
+                        "knee": 0.35, "ankle": 0.44, "waist": 0.1}  # fmt: skip
 
     class rewards(WalkingG1.rewards):
         min_feet_distance = 0.2  # [m]

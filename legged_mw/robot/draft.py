@@ -57,8 +57,8 @@ ENERGY = {2: -0.035, 4: -0.013}
 SLIPPERY = [0.25, 1.2]  # friction of a quadruped's ground [-] [ours: an ANYmal C trained with 0.4 or more fell at 0.3]
 # [s], [m/s] per axis, [rad/s] per axis [go2_rl_gym: 4, 0.4, 0.6]
 PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 0.5, "max_push_ang_vel": 0.6}
-# share of a quadruped's commands at the ends of their ranges [go2_rl_gym] [ours: a Go2 and an ANYmal C that were asked
-# for them too rarely fell as they started at full speed]
+# share of a quadruped's values of each command at the ends of its range [go2_rl_gym] [ours: a Go2 and an ANYmal C without
+# it fell as they started at full speed; with it they were not trained yet]
 ENDS = 0.2
 BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # reward scales of a biped that follows a gait clock
 CLEARANCE = 0.003  # [m] height of the feet above the ground at reset, so that no geom penetrates it

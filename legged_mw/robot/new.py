@@ -55,7 +55,7 @@ _COMMENTS = {
     "iterations": "with fewer the physics of light limbs is not solved [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "clip_actions": "so that a joint is moved by 1 rad at most",
-    "end_probability": "share of commands at the ends of their ranges, so that it learns to start at full speed",
+    "end_probability": "share of its values at the ends of each range, so that it learns to start at full speed",
     "lin_vel_x": "[m/s] LOOK: what you want of it",
     "lin_vel_y": "[m/s]",
     "ang_vel_yaw": "[rad/s]",
@@ -205,7 +205,7 @@ def _learner(found: Draft, train: str) -> list[str]:
                 "            init_std = 0.6  # at 1.0 it does not learn to follow on a few cores [ours: docs/lab.md]"
             ]
         return lines
-    lines = [f"    class cpu({train}.cpu):  # on a CPU worlds are alike and nobody pushes"]
+    lines = [f"    class cpu({train}.cpu):  # on a CPU worlds are alike, nobody pushes"]
     if len(found.feet) == 2:
         overrides = [
             '"commands.keep_probability": [0.7, 0.25, 0.5], "perturbation.curriculum": True,',
