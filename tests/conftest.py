@@ -32,6 +32,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="write tests/golden/errors.txt anew; prints the raises that no case reaches",
     )
+    parser.addoption("--all", action="store_true", help="run the files of LONGEST too")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
@@ -59,6 +60,12 @@ def has_browser() -> bool:
 
 
 LONG = ("test_suite", "test_error_lines", "test_tutorial", "test_unitree_guard", "test_your_own_robot", "test_ranks")
+# a third of the time, of whole programs and campaigns: run with --all, or by name
+LONGEST = (
+    *("campaign", "test_compare", "test_crossing", "test_estimator", "test_first_walk", "test_from_legged_gym"),
+    *("test_gate", "test_memory", "test_ranks", "test_teacher", "test_tutorial", "test_unitree_faults"),
+    *("test_unitree_robot", "test_user_scene", "test_without", "test_your_own_robot"),
+)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -67,6 +74,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     Files that take half a minute and more come first, or at the end one core waits for the other.
     """
     items.sort(key=lambda item: item.path.stem not in LONG)
+    if not config.getoption("--all"):
+        here = Path(__file__).parent
+        named = {Path(arg.partition("::")[0]).resolve() for arg in config.args} - {here}
+        without = [
+            item
+            for item in items
+            if {item.path.stem, item.path.parent.name} & {*LONGEST} and not {item.path, item.path.parent} & named
+        ]
+        config.hook.pytest_deselected(items=without)
+        items[:] = [item for item in items if item not in without]
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     for mark, present in (
         ("gpu", gpus > 0),
