@@ -10,8 +10,5 @@ class G112DofFlatCfg(UprightG1, UprightBipedCfg):
     class asset(UprightG1.asset):
         held_joints = ["waist_*", "*_shoulder_*", "*_elbow_*", "*_wrist_*"]
 
-    class rewards(UprightG1.rewards, UprightBipedCfg.rewards):
-        pass
-
 
 TASK = Task(LeggedRobot, G112DofFlatCfg, UprightBipedCfgPPO)

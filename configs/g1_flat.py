@@ -7,8 +7,7 @@ from legged_mw.utils.task import Task
 
 
 class G1FlatCfg(UprightG1, LevelBipedCfg):
-    class rewards(UprightG1.rewards, LevelBipedCfg.rewards):
-        pass
+    pass
 
 
 TASK = Task(LeggedRobot, G1FlatCfg, LevelBipedCfgPPO)

@@ -9,7 +9,7 @@ start_quickly()  # before torch, as train.py does
 import gc
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -73,17 +73,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     Files that take half a minute and more come first, or at the end one core waits for the other.
     """
+
+    def leave_out(these: Callable[[pytest.Item], object]) -> None:
+        without = [item for item in items if these(item)]
+        config.hook.pytest_deselected(items=without)
+        items[:] = [item for item in items if item not in without]
+
     items.sort(key=lambda item: item.path.stem not in LONG)
     if not config.getoption("--all"):
         here = Path(__file__).parent
         named = {Path(arg.partition("::")[0]).resolve() for arg in config.args} - {here}
-        without = [
-            item
-            for item in items
-            if {item.path.stem, item.path.parent.name} & {*LONGEST} and not {item.path, item.path.parent} & named
-        ]
-        config.hook.pytest_deselected(items=without)
-        items[:] = [item for item in items if item not in without]
+        leave_out(
+            lambda item: (
+                {item.path.stem, item.path.parent.name} & {*LONGEST} and not {item.path, item.path.parent} & named
+            )
+        )
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     for mark, present in (
         ("gpu", gpus > 0),
@@ -92,9 +96,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         ("browser", has_browser()),
     ):
         if not present:
-            without = [item for item in items if item.get_closest_marker(mark)]
-            config.hook.pytest_deselected(items=without)
-            items[:] = [item for item in items if item not in without]
+            leave_out(lambda item, mark=mark: item.get_closest_marker(mark))
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])

@@ -94,7 +94,7 @@ def remembers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", ["go2_flat", "g1_rough", "go1_rough_scan", "remembers"])
+@pytest.mark.parametrize("name", ["go2_flat", "g1_flat", "g1_rough", "go1_rough_scan", "remembers"])
 def test_it_does_what_pythons_controller_does(
     name: str, check: Check, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:

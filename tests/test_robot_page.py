@@ -397,6 +397,10 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
         "class MyGoFlatCfg(SimToRealCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
     )
     assert "(quadruped, 12 joints; " in text and "# effort = " not in text
+    assert "end_probability = 0.2  # share" in text
+    for field, value in load_task("go1_flat").train.cpu.overrides.items():  # a quadruped learns as a Go1 on a CPU
+        known = field in ("commands.curriculum", "commands.curriculum_step")  # in SimToRealCfg
+        assert known or f'"{field}": {value}' in text, field
     simple = config_text(draft(bare, simple=True), GO1, "my_go")
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in simple and "delay_ms" in text and "delay_ms" not in simple
     biped = config_text(draft(TOY), TOY, "toy", mirrors=True)

@@ -1,12 +1,15 @@
 """Unitree G1, a humanoid of 29 joints: for any task, walking, tracking. Masses, motors and ranges are in g1.xml.
 
-Sources: [U] unitree_rl_gym; [UL] unitree_rl_lab; [M] mjlab: gains from rotor inertia, 10 Hz, damping ratio
-2; [B] BeyondMimic; [ours].
+Sources: [U] unitree_rl_gym; [UL] unitree_rl_lab; [M] mjlab: 10 Hz, damping ratio 2; [B] BeyondMimic; [ours].
 """
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
+
+# [rad] 4 times this, times the stiffness, is the motors' highest torque
+SCALE = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "waist_yaw": 0.55, "hip_roll": 0.35,
+         "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # fmt: skip
 
 
 class G1(RobotTaskCfg):
@@ -22,9 +25,7 @@ class G1(RobotTaskCfg):
                      "hip_roll": 99.1, "knee": 99.1, "ankle": 28.5, "waist": 28.5}  # fmt: skip
         damping = {"": 0.907, "wrist_pitch": 1.07, "wrist_yaw": 1.07, "hip": 2.56, "waist_yaw": 2.56,  # [N m s/rad]
                    "hip_roll": 6.31, "knee": 6.31, "ankle": 1.81, "waist": 1.81}  # fmt: skip
-        # 4 times this, times the stiffness, is the motors' highest torque
-        action_scale = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "waist_yaw": 0.55,  # [rad]
-                        "hip_roll": 0.35, "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # fmt: skip
+        action_scale = SCALE
         decimation = 4
 
     class ratings(RobotTaskCfg.ratings):
@@ -59,8 +60,7 @@ class UprightG1(WalkingG1):
     class control(WalkingG1.control):  # [UL]; of [M]'s 28.5 in roll and pitch the torso's weight takes 22 [ours]
         stiffness = {**WalkingG1.control.stiffness, "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]
         damping = {**WalkingG1.control.damping, "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]
-        action_scale = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "hip_roll": 0.35,  # [rad]
-                        "knee": 0.35, "ankle": 0.44, "waist": 0.1}  # fmt: skip
+        action_scale = {**SCALE, "waist": 0.1, "waist_yaw": 0.1}  # [rad] [ours]
 
     class rewards(WalkingG1.rewards):
         min_feet_distance = 0.2  # [m]

@@ -57,7 +57,8 @@ class Limits:
     """Limits of D joints in the contract's order. The first five come from the scene and the contract.
 
     A default without a source is ours: the largest value of the shipped policies of Go1, Go2 and G1 in the walking
-    exam with pushes of 2 m/s, 2026-11-23 (in brackets), plus a margin. A robot's class or a contract can set tighter limits.
+    exam with pushes of 2 m/s (in brackets, 2026-11-23), plus a margin. A robot's class or a contract can set tighter
+    limits.
     """
 
     low: Floats  # (D,) [rad] range of the joints

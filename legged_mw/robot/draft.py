@@ -57,8 +57,8 @@ ENERGY = {2: -0.035, 4: -0.013}
 SLIPPERY = [0.25, 1.2]  # friction of a quadruped's ground [-] [ours: an ANYmal C trained with 0.4 or more fell at 0.3]
 # [s], [m/s] per axis, [rad/s] per axis [go2_rl_gym: 4, 0.4, 0.6]
 PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 0.5, "max_push_ang_vel": 0.6}
-# share of a quadruped's values of each command at the ends of its range [go2_rl_gym] [ours: a Go2 and an ANYmal C without
-# it fell as they started at full speed; with it they were not trained yet]
+# share of each command's values at the ends of its range, for a quadruped [go2_rl_gym] [ours: without it a Go2 and an
+# ANYmal C fell as they started at full speed; with it none was trained on a GPU yet]
 ENDS = 0.2
 BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # reward scales of a biped that follows a gait clock
 CLEARANCE = 0.003  # [m] height of the feet above the ground at reset, so that no geom penetrates it
@@ -280,8 +280,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
     rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
     worlds = {"friction": SLIPPERY, **_worlds(found, (-0.07, 0.2))}
-    chosen["commands"] = {"end_probability": ENDS, **chosen["commands"]}
-    return {**chosen, "domain_rand": worlds, "perturbation": dict(PUSHES), "rewards": rewards}
+    commands = {"end_probability": ENDS, **chosen["commands"]}
+    return {**chosen, "commands": commands, "domain_rand": worlds, "perturbation": dict(PUSHES), "rewards": rewards}
 
 
 def _energy(found: Draft) -> dict[str, float]:

@@ -55,7 +55,7 @@ _COMMENTS = {
     "iterations": "with fewer the physics of light limbs is not solved [ours: docs/your_own_robot.md]",
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "clip_actions": "so that a joint is moved by 1 rad at most",
-    "end_probability": "share of its values at the ends of each range, so that it learns to start at full speed",
+    "end_probability": "share of each command's values at the ends of its range, to learn starts at full speed",
     "lin_vel_x": "[m/s] LOOK: what you want of it",
     "lin_vel_y": "[m/s]",
     "ang_vel_yaw": "[rad/s]",
