@@ -51,14 +51,16 @@ IMPLICIT: dict[str, Any] = {"integrator": "implicitfast", "iterations": 10, "ls_
 # reward scales for a smooth walk of a quadruped: small joint accelerations and foot impacts; those of a biped are in
 # UprightBipedCfg [ours, from terms of legged_gym, walk-these-ways and Playground]
 LOOKS = {"dof_acc": -1e-7, "feet_impact_vel": -0.25, "target_limits": -1.0}
+# reward scale of `termination` for a quadruped: a fall costs what 29 of the best control steps pay; bipeds have -200
+# [ours: docs/archive/drafts.md]
+FALL = -100.0
 # number of feet -> scale of `energy` x robot's mass [kg]: -0.001 for a G1 of 35 kg (docs/archive/go2_and_g1.md), -0.001
 # for a Go1 of 13 kg [Playground]
 ENERGY = {2: -0.035, 4: -0.013}
 SLIPPERY = [0.25, 1.2]  # friction of a quadruped's ground [-] [ours: an ANYmal C trained with 0.4 or more fell at 0.3]
-# [s], [m/s] per axis, [rad/s] per axis [go2_rl_gym: 4, 0.4, 0.6]
-PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 0.5, "max_push_ang_vel": 0.6}
-# share of each command's values at the ends of its range, for a quadruped [go2_rl_gym] [ours: without it a Go2 and an
-# ANYmal C fell as they started at full speed; with it none was trained on a GPU yet]
+# [s], [m/s] per axis, [rad/s] per axis [go2_rl_gym: 4, 0.4, 0.6; ours: docs/archive/drafts.md]
+PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 1.0, "max_push_ang_vel": 0.6}
+# share of each command's values at the ends of its range, for a quadruped [go2_rl_gym]
 ENDS = 0.2
 BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # reward scales of a biped that follows a gait clock
 CLEARANCE = 0.003  # [m] height of the feet above the ground at reset, so that no geom penetrates it
@@ -278,7 +280,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if found.simple:
         return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
     weights = table(pose_weights(found.robot, found.pose, found.feet), names)
-    rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, **_energy(found)}}
+    rewards = {**low, "pose_weights": weights, "scales": {**LOOKS, "termination": FALL, **_energy(found)}}
     worlds = {"friction": SLIPPERY, **_worlds(found, (-0.07, 0.2))}
     commands = {"end_probability": ENDS, **chosen["commands"]}
     return {**chosen, "commands": commands, "domain_rand": worlds, "perturbation": dict(PUSHES), "rewards": rewards}

@@ -72,6 +72,7 @@ _COMMENTS = {
     "dof_acc": "no jerks",
     "feet_impact_vel": "no stamping",
     "target_limits": "no targets beyond a joint's range",
+    "termination": "a fall costs more than a faster start pays",
     "max_push_ang_vel": "[rad/s] a push turns it too",
     "feet_orientation": "soles level",
     "energy": "by its mass",
@@ -219,6 +220,7 @@ def _learner(found: Draft, train: str) -> list[str]:
             '"commands.keep_probability": [0.6, 0.25, 0.75], "perturbation.growth": [0.15, 0.4],',
             '"rewards.tracking_sigma": 0.35, "rewards.tracking_sigma_end": 0.15,',
             '"rewards.scales.tracking_ang_vel": 1.5, "algorithm.entropy_coef": 0.01,',
+            '"rewards.scales.termination": -1.0,',
         ]
     return [*lines, "        overrides = {", *(f"            {line}" for line in overrides), "        }"]
 
