@@ -398,6 +398,7 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     )
     assert "(quadruped, 12 joints; " in text and "# effort = " not in text
     assert "end_probability = 0.2  # share" in text
+    assert "offsets = [0.0, 0.5, 0.5, 0.0]" in text  # FR and RL, then FL and RR
     for field, value in load_task("go1_flat").train.cpu.overrides.items():  # a quadruped learns as a Go1 on a CPU
         known = field in ("commands.curriculum", "commands.curriculum_step")  # in SimToRealCfg
         assert known or f'"{field}": {value}' in text, field

@@ -56,6 +56,7 @@ _COMMENTS = {
     "action_scale": "[rad] an action of 1 moves a joint so far",
     "clip_actions": "so that a joint is moved by 1 rad at most",
     "end_probability": "share of each command's values at the ends of its range, to learn starts at full speed",
+    "period": "[s] no reward asks for it; without a clock left and right legs start alike [ours: docs/archive/drafts.md]",
     "lin_vel_x": "[m/s] LOOK: what you want of it",
     "lin_vel_y": "[m/s]",
     "ang_vel_yaw": "[rad/s]",
