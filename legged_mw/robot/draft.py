@@ -297,11 +297,16 @@ def _clock(found: Draft) -> dict[str, dict[str, Any]]:
     """A clock of a trot for four feet, without a reward: with mirrored data, nothing else tells left from right."""
     if len(found.feet) != 4:
         return {}
-    data = posed(found.robot.physics, found.pose)
-    geoms = [[found.robot.id("geom", name) for name in foot.geoms] for foot in found.feet]
-    places = np.array([data.geom_xpos[each].mean(axis=0)[:2] for each in geoms])
+    places = _places(found)
     front, left = (places > places.mean(axis=0)).T
     return {"gait": {"period": 0.5, "offsets": [0.5 if each else 0.0 for each in front == left]}}
+
+
+def _places(found: Draft) -> NDArray[np.float64]:
+    """(F, 2) Middle of each foot's geoms in the default pose: ahead, to the left [m]."""
+    data = posed(found.robot.physics, found.pose)
+    geoms = [[found.robot.id("geom", name) for name in foot.geoms] for foot in found.feet]
+    return np.array([data.geom_xpos[each].mean(axis=0)[:2] for each in geoms])
 
 
 def _energy(found: Draft) -> dict[str, float]:
@@ -329,8 +334,7 @@ def _motors(found: Draft) -> dict[str, dict[str, float]]:
 def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The config values of a biped, in place of BipedCfg's values for a G1. A simple task has fewer difficulties."""
     robot = found.robot
-    data = posed(robot.physics, found.pose)
-    left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
+    left, right = _places(found)
     weights = (WALKS, ANKLE, HELD, QUIET) if found.simple else UPRIGHT
     rewards: dict[str, Any] = {
         **low,
