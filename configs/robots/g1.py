@@ -29,8 +29,7 @@ class G1(RobotTaskCfg):
         decimation = 4
 
     class ratings(RobotTaskCfg.ratings):
-        # Unitree's unitree_rl_lab, unitree_actuators.py: N7520-14.3, N7520-22.5, N5020-16, W4010-25. Unknown of ankles
-        # and of waist roll and pitch, which two motors turn together. No other figure is known to us: docs/heat.md
+        # unitree_rl_lab's unitree_actuators.py; unknown: ankles, waist roll and pitch, each of two motors (docs/heat.md)
         peak_torque = {"hip": 71.0, "waist_yaw": 71.0, "hip_roll": 111.0, "knee": 111.0, "shoulder": 24.8,  # [N m]
                        "elbow": 24.8, "wrist_roll": 24.8, "wrist": 4.8}  # fmt: skip
         knee_speed = {"hip": 22.63, "waist_yaw": 22.63, "hip_roll": 14.5, "knee": 14.5, "shoulder": 30.86,  # [rad/s]
@@ -57,10 +56,12 @@ class WalkingG1(G1, LeggedRobotCfg):
 
 
 class UprightG1(WalkingG1):
-    class control(WalkingG1.control):  # [UL]; of [M]'s 28.5 in roll and pitch the torso's weight takes 22 [ours]
-        stiffness = {**WalkingG1.control.stiffness, "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]
-        damping = {**WalkingG1.control.damping, "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]
-        action_scale = {**SCALE, "waist": 0.1, "waist_yaw": 0.1}  # [rad] [ours]
+    class control(WalkingG1.control):  # legs [U], waist [UL]: with [M]'s, soft motors and loads topple it [ours]
+        stiffness = {"": 14.25, "wrist_pitch": 16.78, "wrist_yaw": 16.78, "hip": 100.0, "knee": 150.0, "ankle": 40.0,
+                     "waist": 200.0}  # [N m/rad]  # fmt: skip
+        damping = {"": 0.907, "wrist_pitch": 1.07, "wrist_yaw": 1.07, "hip": 2.0, "knee": 4.0, "ankle": 2.0,
+                   "waist": 5.0}  # [N m s/rad]  # fmt: skip
+        action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [rad]
 
     class rewards(WalkingG1.rewards):
         min_feet_distance = 0.2  # [m]
