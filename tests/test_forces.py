@@ -355,7 +355,7 @@ def test_a_fallen_g1_lies_on_the_ground(engine: str, worlds: int) -> None:
     quat = draw.normal(size=(worlds, 4))
     sim.qpos[:, 2], sim.qpos[:, 3:7] = 1.0, torch.tensor(quat / np.linalg.norm(quat, axis=1)[:, None])
     sim.qpos[:, 7:] = torch.tensor(draw.uniform(*env.robot.joint_range.T, size=(worlds, 29)))
-    for _ in range(40):
+    for _ in range(60):
         sim.step(5)
     before = sim.qpos.clone(), sim.qvel.clone()
     sim.step()
