@@ -37,6 +37,7 @@ from legged_mw.utils.cli import one_line_errors
 
 START = 6.0  # [s] when the remote's start button is pressed
 CHIRP = 61.0  # [s] of the way to the pose, and the sweeps
+SPARE = 1.1  # more time than that, as a busy machine leaves periods out; the chirp ends by itself
 ENCODER, SPEED, GYRO, FORCE = 0.001, 0.02, 0.005, 0.05  # [rad], [rad/s], [rad/s], [m/s^2] standard deviations of noise
 
 
@@ -121,7 +122,7 @@ def serve(folder: Path, change: Change, domain: int, seconds: float) -> None:
 def record(folder: Path, change: Change, domain: int, log: Path) -> None:
     """Drive the robot, which another process serves, through its chirp."""
     joints = len(read_contract(folder).joints)
-    seconds = START + SETTLE + joints * (2 * RAMP + HOLD + REST) + CHIRP
+    seconds = SPARE * (START + SETTLE + joints * (2 * RAMP + HOLD + REST) + CHIRP)
     robot = multiprocessing.get_context("spawn").Process(target=serve, args=(folder, change, domain, seconds + START))
     robot.start()
     asked = ["--robot", "unitree", "--interface", "lo", "--domain", str(domain), "--chirp", "--log", str(log)]
