@@ -157,9 +157,9 @@ def test_a_log_that_cannot_be_fitted_is_refused(log: Path, change: Callable[[Dri
 def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:
     swing = np.sin(np.arange(1000.0))
     joint = fit.FittedJoint(JOINT, np.zeros(6), np.zeros(6), 0.5, 0.36, np.arange(1000.0), np.stack([swing] * 3))
-    with pytest.raises(LogError, match=r"FL_calf_joint cannot be fitted: the fitted parameters explain 74.1%"):
-        fit._check_explained(Path("log"), CALF, joint)
-    fit._check_explained(Path("log"), CALF, joint._replace(after=0.05))
+    with pytest.raises(LogError, match=r"cannot be fitted: FL_calf_joint \(74.1%\): the fitted parameters explain"):
+        fit._check_explained(Path("log"), CONTRACT.joints, [joint])
+    fit._check_explained(Path("log"), CONTRACT.joints, [joint._replace(after=0.05)])
 
 
 @pytest.mark.parametrize(("name", "slots"), [("go2_flat", 3), ("g1_flat", 7)])

@@ -138,8 +138,7 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
     selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
     sweeps = read_sweeps(path, recording, contract, scene.model, selected)
     fitted = [_fit_joint(Chain(scene.spec, contract, sweep)) for sweep in sweeps]
-    for each in fitted:
-        _check_explained(path, contract.joints[each.joint], each)
+    _check_explained(path, contract.joints, fitted)
     return Fit(contract, recording, fitted, time.monotonic() - began)
 
 
@@ -191,13 +190,14 @@ def _check_joint(path: Path, name: str, joint: int, rows: dict[str, Floats], ste
     raise LogError(f"{shown(path)}: {name} cannot be fitted: {why}")
 
 
-def _check_explained(path: Path, name: str, fitted: FittedJoint) -> None:
-    """Raise LogError if the simulation with the fitted parameters does not reproduce the joint's motion."""
-    explained = max(0.0, 1.0 - fitted.after**2 / float(fitted.angles[0].var()))
-    if explained < EXPLAINED:
+def _check_explained(path: Path, joints: Sequence[str], fitted: Sequence[FittedJoint]) -> None:
+    """Raise LogError if the simulation with the fitted parameters does not reproduce each joint's motion."""
+    shares = {joints[each.joint]: max(0.0, 1.0 - each.after**2 / float(each.angles[0].var())) for each in fitted}
+    if poor := {name: share for name, share in shares.items() if share < EXPLAINED}:
+        named = ", ".join(f"{name} ({share:.1%})" for name, share in poor.items())
         raise LogError(
-            f"{shown(path)}: {name} cannot be fitted: the fitted parameters explain {explained:.1%} of its motion: it is loose, "
-            f"touches something, or carries the robot; --leave_out {name} fits the others"
+            f"{shown(path)}: cannot be fitted: {named}: the fitted parameters explain so little of the motion, not {EXPLAINED:.0%}: "
+            f"a joint is loose, touches something, or carries the robot; --leave_out {next(iter(poor))} fits the others"
         )
 
 
