@@ -239,7 +239,7 @@ class LevelBipedCfg(UprightBipedCfg):
             energy = -0.002  # of a G1
 
     class perturbation(UprightBipedCfg.perturbation):
-        # with 6 m/s, and 0.5 m/s each 3 s, it survives 0.62 of the pushes of 2 m/s, and now all
+        # with 6 m/s, and 0.5 m/s each 3 s, it survives 0.62 of the pushes of 2 m/s; with 0.8 m/s each 2.5 s all
         velocity = [0.0, 8.0]  # [m/s]
         push_interval_s, max_push_vel_xy = 2.5, 1.2  # [s], [m/s]
 

@@ -1,4 +1,7 @@
-"""Unitree G1 walks with its legs only; waist and arms are held, as on Unitree's G1 with 12 joints."""
+"""Unitree G1 walks with its legs only; waist and arms are held, as on Unitree's G1 with 12 joints.
+
+Its gains are WalkingG1's, with which the policy that ships was trained.
+"""
 
 from configs.base import UprightBipedCfg, UprightBipedCfgPPO
 from configs.robots.g1 import UprightG1, WalkingG1

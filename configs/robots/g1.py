@@ -7,7 +7,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 
-# [rad] 4 times this, times the stiffness, is the motors' highest torque
+# [rad] 4 times this, times [M]'s stiffness, is the motors' highest torque
 SCALE = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "waist_yaw": 0.55, "hip_roll": 0.35,
          "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # fmt: skip
 
@@ -56,12 +56,12 @@ class WalkingG1(G1, LeggedRobotCfg):
 
 
 class UprightG1(WalkingG1):
-    class control(WalkingG1.control):  # legs [U], waist [UL]: with [M]'s, soft motors and loads topple it [ours]
+    class control(WalkingG1.control):  # legs [U], waist [UL]; beside [M]'s: docs/archive/go2_and_g1.md
         stiffness = {"": 14.25, "wrist_pitch": 16.78, "wrist_yaw": 16.78, "hip": 100.0, "knee": 150.0, "ankle": 40.0,
                      "waist": 200.0}  # [N m/rad]  # fmt: skip
         damping = {"": 0.907, "wrist_pitch": 1.07, "wrist_yaw": 1.07, "hip": 2.0, "knee": 4.0, "ankle": 2.0,
                    "waist": 5.0}  # [N m s/rad]  # fmt: skip
-        action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [rad]
+        action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [ours]
 
     class rewards(WalkingG1.rewards):
         min_feet_distance = 0.2  # [m]
