@@ -62,9 +62,10 @@ def has_browser() -> bool:
 LONG = ("test_suite", "test_error_lines", "test_tutorial", "test_unitree_guard", "test_your_own_robot", "test_ranks")
 # a third of the time, of whole programs and campaigns: run with --all, or by name
 LONGEST = (
-    *("campaign", "test_compare", "test_crossing", "test_estimator", "test_first_walk", "test_from_legged_gym"),
-    *("test_gate", "test_memory", "test_ranks", "test_teacher", "test_tutorial", "test_unitree_faults"),
-    *("test_unitree_robot", "test_user_scene", "test_without", "test_your_own_robot"),
+    *("campaign", "test_compare", "test_crossing", "test_error_lines", "test_estimator", "test_first_walk"),
+    *("test_from_legged_gym", "test_gate", "test_memory", "test_ranks", "test_teacher", "test_tutorial"),
+    *("test_unitree_faults", "test_unitree_guard", "test_unitree_robot", "test_user_scene", "test_without"),
+    "test_your_own_robot",
 )
 
 
