@@ -60,7 +60,7 @@ def has_browser() -> bool:
 
 
 LONG = ("test_suite", "test_error_lines", "test_tutorial", "test_unitree_guard", "test_your_own_robot", "test_ranks")
-# a third of the time, of whole programs and campaigns: run with --all, or by name
+# over a third of the time, of whole programs and campaigns: run with --all, or by name
 LONGEST = (
     *("campaign", "test_compare", "test_crossing", "test_error_lines", "test_estimator", "test_first_walk"),
     *("test_from_legged_gym", "test_gate", "test_memory", "test_ranks", "test_teacher", "test_tutorial"),

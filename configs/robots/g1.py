@@ -57,10 +57,10 @@ class WalkingG1(G1, LeggedRobotCfg):
 
 class UprightG1(WalkingG1):
     class control(WalkingG1.control):  # legs [U], waist [UL]; beside [M]'s: docs/archive/go2_and_g1.md
-        stiffness = {"": 14.25, "wrist_pitch": 16.78, "wrist_yaw": 16.78, "hip": 100.0, "knee": 150.0, "ankle": 40.0,
-                     "waist": 200.0}  # [N m/rad]  # fmt: skip
-        damping = {"": 0.907, "wrist_pitch": 1.07, "wrist_yaw": 1.07, "hip": 2.0, "knee": 4.0, "ankle": 2.0,
-                   "waist": 5.0}  # [N m s/rad]  # fmt: skip
+        stiffness = {**WalkingG1.control.stiffness, "hip": 100.0, "hip_roll": 100.0, "knee": 150.0, "ankle": 40.0,
+                     "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]  # fmt: skip
+        damping = {**WalkingG1.control.damping, "hip": 2.0, "hip_roll": 2.0, "knee": 4.0, "ankle": 2.0,
+                   "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]  # fmt: skip
         action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [ours]
 
     class rewards(WalkingG1.rewards):

@@ -195,9 +195,10 @@ def _check_explained(path: Path, joints: Sequence[str], fitted: Sequence[FittedJ
     shares = {joints[each.joint]: max(0.0, 1.0 - each.after**2 / float(each.angles[0].var())) for each in fitted}
     if poor := {name: share for name, share in shares.items() if share < EXPLAINED}:
         named = ", ".join(f"{name} ({share:.1%})" for name, share in poor.items())
+        without = " ".join(f"--leave_out {name}" for name in poor)
         raise LogError(
             f"{shown(path)}: cannot be fitted: {named}: the fitted parameters explain so little of the motion, not {EXPLAINED:.0%}: "
-            f"a joint is loose, touches something, or carries the robot; --leave_out {next(iter(poor))} fits the others"
+            f"a joint is loose, touches something, or carries the robot; {without} fits the others"
         )
 
 

@@ -299,7 +299,7 @@ def _clock(found: Draft) -> dict[str, dict[str, Any]]:
         return {}
     places = _places(found)
     front, left = (places > places.mean(axis=0)).T
-    return {"gait": {"period": 0.5, "offsets": [0.5 if each else 0.0 for each in front == left]}}
+    return {"gait": {"period": 0.5, "offsets": (0.5 * (front == left)).tolist()}}
 
 
 def _places(found: Draft) -> NDArray[np.float64]:
