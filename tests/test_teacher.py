@@ -173,6 +173,23 @@ def test_ppo_goes_on_from_the_student(tuned: Path, student: Path) -> None:
     )
 
 
+def test_the_limits_of_exploration_are_the_new_tasks(root: Path, student: Path) -> None:
+    (root / "quiet.py").write_text(
+        "from configs.go1_rough import Go1RoughCfgPPO\n"
+        "from configs.go1_rough_student import Go1RoughStudentCfg\n"
+        "from legged_mw.envs.legged_robot import LeggedRobot\n"
+        "from legged_mw.utils.task import Task\n\n\n"
+        "class QuietCfgPPO(Go1RoughCfgPPO):\n"
+        "    class actor(Go1RoughCfgPPO.actor):\n"
+        "        class distribution_cfg(Go1RoughCfgPPO.actor.distribution_cfg):\n"
+        "            std_range = [0.05, 0.3]\n\n\n"
+        "TASK = Task(LeggedRobot, Go1RoughStudentCfg, QuietCfgPPO)\n"
+    )
+    begun = ["--task", str(root / "quiet.py"), "--init", str(student), *ROUGH, *WIDE, "--max_iterations", "1"]
+    config = load_yaml(trained(root, *begun) / "config.yaml")
+    assert config["actor"]["distribution_cfg"]["std_range"] == [0.05, 0.3]
+
+
 def test_a_warm_up_goes_on_when_it_is_resumed(tuned: Path, tmp_path: Path) -> None:
     """Stopped after one of two iterations of warm-up, the next one is the second: the actor still stands."""
     folder = tmp_path / "logs/go1_rough_student/run"

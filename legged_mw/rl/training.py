@@ -92,7 +92,9 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
         fields = ", ".join(["worlds", "networks", "learner", *task.train.cpu.overrides])
         print(f"on a CPU the section cpu sets {fields}; flags win, --set cpu.enable=false leaves it out")
     if start.policy:
-        task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
+        actor = start.policy.task.train.to_dict()["actor"]
+        del actor["distribution_cfg"]["std_range"]  # the limits of exploration are the new task's
+        task.update({"actor": actor}, where="--init")
     if fitted or start.policy:
         apply_overrides(task, args)  # again, because flags win
     if this_rank().leads and not args.check:
