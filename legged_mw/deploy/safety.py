@@ -56,8 +56,8 @@ class Tripped(RobotError):
 class Limits:
     """Limits of D joints in the contract's order. The first five come from the scene and the contract.
 
-    A default without a source is ours: the largest value of the shipped policies of Go1, Go2 and G1 in the walking
-    exam with pushes of 2 m/s (in brackets, 2026-11-23), plus a margin. A robot's class or a contract can set tighter
+    A default without a source is ours: the largest value of the ten shipped policies that walk, in the walking exam
+    with the pushes of its mark (in brackets, 2026-11-29), plus a margin. A robot's class or a contract can set tighter
     limits.
     """
 
@@ -67,12 +67,12 @@ class Limits:
     # (D,) [rad] range of the targets in the contract; `held` clips to it as training does, because drives do not
     lowest: Floats
     highest: Floats  # (D,) [rad]
-    position: float = 0.25  # [rad] measured angle beyond the range [0.15: simulated joint limits are soft]
+    position: float = 0.25  # [rad] measured angle beyond the range [0.23: simulated joint limits are soft]
     target: float = 0.9  # [rad] target beyond the range [0.62]
-    step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.85]
-    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.52]
-    speed: float = 60.0  # [rad/s] joint speed [48]
-    # [deg] tilt of the body [30]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
+    step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.99]
+    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.67; go1_rough 2.26, in a push]
+    speed: float = 60.0  # [rad/s] joint speed [52]
+    # [deg] tilt of the body [31]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
     tilt: float = 60.0
     temperature: float = 85.0  # [deg C] of a motor; drives switch off at 90
     voltage: float = -OFF  # [V] lowest voltage of the battery; a robot's class sets it
