@@ -182,12 +182,14 @@ def test_the_limits_of_exploration_are_the_new_tasks(root: Path, student: Path) 
         "class QuietCfgPPO(Go1RoughCfgPPO):\n"
         "    class actor(Go1RoughCfgPPO.actor):\n"
         "        class distribution_cfg(Go1RoughCfgPPO.actor.distribution_cfg):\n"
-        "            std_range = [0.05, 0.3]\n\n\n"
+        "            std_range = [0.05, 0.2]\n\n\n"
         "TASK = Task(LeggedRobot, Go1RoughStudentCfg, QuietCfgPPO)\n"
     )
     begun = ["--task", str(root / "quiet.py"), "--init", str(student), *ROUGH, *WIDE, "--max_iterations", "1"]
-    config = load_yaml(trained(root, *begun) / "config.yaml")
-    assert config["actor"]["distribution_cfg"]["std_range"] == [0.05, 0.3]
+    quiet = trained(root, *begun)
+    assert load_yaml(quiet / "config.yaml")["actor"]["distribution_cfg"]["std_range"] == [0.05, 0.2]
+    noise = load(quiet / "model_1.pt")["actor_state_dict"]["distribution.std_param"]
+    assert noise.unique().tolist() == [pytest.approx(0.198)]  # of 0.2: at the bound it would have no gradient
 
 
 def test_a_warm_up_goes_on_when_it_is_resumed(tuned: Path, tmp_path: Path) -> None:

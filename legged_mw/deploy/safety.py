@@ -70,8 +70,8 @@ class Limits:
     position: float = 0.25  # [rad] measured angle beyond the range [0.23: simulated joint limits are soft]
     target: float = 0.9  # [rad] target beyond the range [0.62]
     step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.99]
-    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.67; go1_rough 2.26, in a push]
-    speed: float = 60.0  # [rad/s] joint speed [52]
+    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.67; go1_rough_scan 2.26, pushed]
+    speed: float = 60.0  # [rad/s] joint speed [53]
     # [deg] tilt of the body [31]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
     tilt: float = 60.0
     temperature: float = 85.0  # [deg C] of a motor; drives switch off at 90

@@ -263,7 +263,9 @@ def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any
     settings["critic_warmup"] = start.critic_warmup if start.policy and not teacher else 0
     noise = settings["actor"].get("distribution_cfg", {})
     if "init_std" in noise and (teacher or start.policy):
-        noise["init_std"] = distillation["init_std"] if teacher else start.init_std
+        wanted, (low, high) = distillation["init_std"] if teacher else start.init_std, noise["std_range"]
+        # within its range: the std is clamped, so at or beyond a bound it has no gradient and would stay
+        noise["init_std"] = min(max(wanted, 1.01 * low), 0.99 * high)
     if teacher:
         groups = {"student": settings["obs_groups"]["actor"], "teacher": [TEACHER]}
         algorithm = {name: value for name, value in distillation.items() if name not in ("teacher", "init_std")}
