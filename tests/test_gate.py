@@ -24,6 +24,7 @@ from legged_mw.unitree import deploy_yaml
 from legged_mw.utils.errors import UserError
 
 GO2 = ROOT / "resources/policies/go2_flat"
+ROUGH = ROOT / "resources/policies/go2_rough"  # without a clock, which that program does not know
 Program = Callable[..., int]
 
 
@@ -118,10 +119,10 @@ def test_a_seed_turns_joints_and_seed_zero_nothing() -> None:
 
 def test_deploy_yaml_acts_as_the_contract_does(tmp_path: Path) -> None:
     """The file is read as unitree_rl_lab's C++ does it: terms in order, scaled, gains by motor, offset plus scale."""
-    contract = read_contract(GO2)
-    deploy_yaml.write(GO2, contract, tmp_path)
+    contract = read_contract(ROUGH)
+    deploy_yaml.write(ROUGH, contract, tmp_path)
     said = yaml.safe_load((tmp_path / "params/deploy.yaml").read_text())
-    stage, controller = DeployStage(GO2, 1), Controller(GO2, contract, 1)
+    stage, controller = DeployStage(ROUGH, 1), Controller(ROUGH, contract, 1)
     stage.scatter(1)
     measured, command = stage.measured, np.array([[0.5, -0.2, 0.3]])
     targets = controller.act(measured, command)[0]

@@ -98,7 +98,7 @@ def test_its_conditions_and_its_looks(tmp_path: Path, monkeypatch: pytest.Monkey
     assert walk and walk.limit.tolist() == [23.0, 23.0, 45.0] * 4
     found = hard.looks(walk)
     assert walk.force.sum(axis=1).mean() / walk.weight == pytest.approx(1.0, abs=0.06)
-    assert 2.0 < found["strides"] < 3.0 and found["sole_tilt"] is None
+    assert 1.9 < found["strides"] < 3.0 and found["sole_tilt"] is None
 
 
 def test_joints_without_a_limit_get_the_exports(tmp_path: Path) -> None:

@@ -47,3 +47,13 @@ class WalkingGo2(Go2, LeggedRobotCfg):
 
     class exam(LeggedRobotCfg.exam):
         peer = "go2"
+
+
+class RandomGo2(WalkingGo2):
+    """From the scene's numbers to the published ones of a real Go2 (docs/fit.md)."""
+
+    class asset(WalkingGo2.asset):
+        armature = {"hip": 0.0135, "thigh": 0.015, "calf": 0.03}  # [kg m^2] the middle
+
+    class domain_rand(WalkingGo2.domain_rand):
+        armature, frictionloss, damping = [0.6, 1.75], [0.8, 3.5], [0.9, 1.8]  # [-]

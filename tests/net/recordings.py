@@ -170,6 +170,7 @@ RECORDINGS: dict[str, Recording] = {
         "go2_flat",
         WALKING
         | CURVE
+        | {"rewards.scales.target_limits": 0.0}
         | {"control.actuator": "torque", "control.action_scale": {"": 8.0, "calf": 25.0}, "asset.effort": {"": 12.0}}
         | {"domain_rand.slope": [-10.0, 10.0], "domain_rand.action_delay": [0, 1]},
     ),
