@@ -103,6 +103,20 @@ def test_rewards_of_getup(go1: Getup) -> None:
     assert not go1._fallen().any()
 
 
+def test_power_and_shock_of_getup(go1: Getup) -> None:
+    """At the soft values: nothing. One joint drives with 750 W and one brakes with 300 W; 5 g. Far beyond: 64."""
+    for values in (go1.dof_vel, go1.torques, go1.accelerometer):
+        values.zero_()
+    go1.dof_vel[0, 0], go1.torques[0, 0] = 10.0, 70.0
+    go1.dof_vel[1, :2], go1.torques[1, :2] = torch.tensor([10.0, -6.0]), torch.tensor([75.0, 50.0])
+    go1.dof_vel[2, 5], go1.torques[2, 5] = -20.0, 1000.0
+    go1.accelerometer[:3] = 9.81 * torch.tensor([[0.0, -1.5, 0.0], [3.0, 0.0, -4.0], [0.0, 0.0, 100.0]])
+    expected = {"power": [0.0, 0.5**2, 64.0, 0.0], "shock": [0.0, 3.5**2, 64.0, 0.0]}
+    for name, wanted in expected.items():
+        value = getattr(go1, f"_reward_{name}")()
+        torch.testing.assert_close(value, torch.tensor(wanted), atol=1e-5, rtol=1e-5, msg=name)
+
+
 def test_pull_lifts_and_fades() -> None:
     """On the body that was asked for; a quarter of episodes that end down undo three that end up; it is in a checkpoint."""
     env = make("go1_getup", falls__states=4, falls__pull=0.5, falls__pull_on="FR_hip")

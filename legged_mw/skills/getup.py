@@ -15,7 +15,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.simulation import Simulation
 from legged_mw.skills.drop_states import fallen
 from legged_mw.skills.skill_config import SkillCfg, SkillCfgPPO
-from legged_mw.utils.bounds import Count, NonNegativeInt, PositiveShare, Seconds, Share, above
+from legged_mw.utils.bounds import Count, NonNegativeInt, Positive, PositiveShare, Seconds, Share, above
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign
@@ -62,6 +62,8 @@ class GetupCfg(SkillCfg):
 
     class rewards(SkillCfg.rewards):
         only_positive_rewards = False  # [ours, P True: no fall ends an episode, and thrashing would cost nothing]
+        soft_power: Positive = 700.0  # of all joints together, of `power` [W] [ours: a G1's, which took 3.2 kW]
+        soft_acceleration: Positive = 1.5  # of the IMU, of `shock`, in multiples of 9.81 m/s^2 [-] [ours: 1 at rest]
 
         class scales(SkillCfg.rewards.scales):  # [P], with our terms of the same meaning
             upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
@@ -190,3 +192,19 @@ class Getup(RobotTask):
         """Joints at rest, while it is up. [P: small actions, all or nothing; ours: as the exam]"""
         high = ((self.base_height / self.up_height - 0.6) / 0.3).clamp(0.0, 1.0)
         return self._near_upright() * high * torch.exp(-0.5 * self.dof_vel.square().mean(dim=1))
+
+    def _reward_power(self) -> Tensor:
+        """Square of the sum of |joint velocity * torque| beyond ``rewards.soft_power``, as a share of it [-]. [ours]
+
+        At most 64. A burst costs more than the same energy given evenly, which `energy` does not tell apart.
+        """
+        power = (self.dof_vel * self.torques).abs().sum(dim=1)
+        return (power / self.cfg.rewards.soft_power - 1.0).clamp(0.0, 8.0).square()
+
+    def _reward_shock(self) -> Tensor:
+        """Square of the IMU's proper acceleration beyond ``rewards.soft_acceleration``, both in g [-]. [ours]
+
+        At most 64. It is what the last simulation step of a control step had: blows in between are missed.
+        """
+        acceleration = self.accelerometer.norm(dim=1) / 9.81
+        return (acceleration - self.cfg.rewards.soft_acceleration).clamp(0.0, 8.0).square()
