@@ -351,6 +351,15 @@ def test_threads_change_no_bit(contract: Contract) -> None:
 # ---- the stage, for viewers and the exam
 
 
+def test_a_refresh_keeps_every_robots_torque(contract: Contract) -> None:
+    fleet, random = Fleet(SHIPPED, contract, 4, 2), np.random.default_rng(0)
+    for _ in range(3):
+        fleet.write(contract.default_pose + 0.3 * random.standard_normal((4, len(contract.joints))))
+    torque = fleet.motor_torque()
+    fleet.refresh()
+    np.testing.assert_array_equal(fleet.motor_torque(), torque)
+
+
 def test_stage() -> None:
     stage = DeployStage(SHIPPED, 3, command=(0.5, 0.0, 0.0))
     assert stage.num_worlds == 3 and stage.dt == 0.02 and stage.qpos().shape == (3, 19)

@@ -124,7 +124,9 @@ class Fleet:
         # (N, nq) view: position [m], quaternion, joints in MuJoCo's order
         self.qpos: Floats = self._batch.bind("qpos")
         self.qvel: Floats = self._batch.bind("qvel")  # (N, nv) view; the next step starts from the written values
-        self._forces: Floats = self._batch.bind("qfrc_actuator")  # (N, nv) of the last physics step
+        # (N, nv) of the last physics step, and a copy: `forward` leaves in it what a thread stepped last
+        self._forces: Floats = self._batch.bind("qfrc_actuator")
+        self._driven = self._forces.copy()
         self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
         self._where, self._contacts = scene.sensordata, scene.contacts
         # (N,) true if MuJoCo failed to step the robot since its reset
@@ -169,7 +171,7 @@ class Fleet:
     def motor_torque(self) -> Floats:
         """(N, D) [N m] torque of each motor in the last physics step, including a servo's damping."""
         damping = self.contract.damping if self.damps_by_joint else 0.0
-        return self._forces[:, self._dofs] - damping * self.qvel[:, self._dofs]
+        return self._driven[:, self._dofs] - damping * self.qvel[:, self._dofs]
 
     def motor_speed(self) -> Floats:
         """(N, D) [rad/s] speed of each joint."""
@@ -189,6 +191,7 @@ class Fleet:
             self._batch.step(nstep=count, stage=stage)
         except SimulationError as error:  # the other worlds have been stepped
             self.broken[error.ids] = True
+        self._driven[:] = self._forces
 
     def fell(self) -> NDArray[np.bool_]:
         """(N,) true for a fall by the contract's `ends` or a state that is not finite."""
@@ -211,7 +214,7 @@ class Fleet:
         """Reset the robots ``which`` (indices; None: all) to the first keyframe, at rest."""
         which = np.arange(self.count) if which is None else np.asarray(which)
         self._batch.reset(which, keyframe=0, stage=_NOW)
-        self.broken[which] = False
+        self.broken[which], self._driven[which] = False, 0.0
         self._sent[:, which] = self._start[which]
         if self._network:
             self._network.reset(which)
