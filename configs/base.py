@@ -319,6 +319,50 @@ class BipedRoughCfgPPO(BipedCfgPPO):
         desired_kl = 0.0  # [ours: not annealed; if it shrinks, the learning rate falls to 1e-5]
 
 
+class LevelBipedRoughCfg(LevelBipedCfg):
+    """A level biped of a G1's size on rough ground, trained from a policy of the flat: train.py --init g1_flat.
+
+    Numbers without a source: [ours: docs/archive/go2_and_g1.md, a level trunk on rough ground].
+    """
+
+    class terrain(BipedRoughCfg.terrain):
+        terrain_proportions = {
+            **{"flat": 0.1, "smooth_slope": 0.1, "rough_slope": 0.1, "stairs_up": 0.3, "stairs_down": 0.15},
+            **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.05},
+        }
+
+    class rewards(LevelBipedCfg.rewards):
+        swing_height = 0.16  # [m]
+
+        class scales(LevelBipedCfg.rewards.scales):
+            orientation = -10.0
+            joint_deviation = -1.5
+            feet_impact_vel = -0.3
+            feet_orientation = -0.5
+            feet_phase = 2.0
+            contact_phase = 0.5
+            pose = 0.7
+            action_rate = -0.015
+
+    class perturbation(LevelBipedCfg.perturbation):
+        velocity = [0.0, 6.0]  # [m/s]
+        push_interval_s, max_push_vel_xy = 3.0, 1.0  # [s], [m/s]
+
+
+class LevelBipedRoughCfgPPO(LevelBipedCfgPPO):
+    """The learner's config of a level biped on rough ground: longer rollouts and a longer horizon."""
+
+    class runner(LevelBipedCfgPPO.runner):
+        num_steps_per_env = 24  # [legged_gym]
+        max_iterations = 1600  # [ours: 315 M steps; the level still rises]
+
+    class algorithm(LevelBipedCfgPPO.algorithm):
+        gamma = 0.99  # [legged_gym]
+
+    class warm_start(LevelBipedCfgPPO.warm_start):
+        init_std = 0.5  # more than 0.2: g1_flat never lifts a foot onto a step
+
+
 class BipedGetupCfg(GetupCfg):
     """Getting up, for a biped of a G1's size."""
 

@@ -93,9 +93,9 @@ def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
 
 
 def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tmp_path: Path) -> None:
-    """Of g1_rough, whose policy asks its ankles for more than their range in every step; the scene is not there."""
+    """Of go2_rough, whose policy asks its calves for more than their range; the scene is not there."""
     seed_everything(0)  # two simulations of an arbitrary walk may part by more than is compared
-    folder, task = ROOT / "resources/policies/g1_rough", load_task("g1_rough")
+    folder, task = ROOT / "resources/policies/go2_rough", load_task("go2_rough")
     update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
     rollout.prepare(task)
     task.cfg.env.num_envs = 2
@@ -109,17 +109,17 @@ def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tm
     stage.fleet.qpos[:], stage.fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
     stage.fleet.refresh()
     stage.measured = stage.fleet.read()
-    ankles = [i for i, name in enumerate(contract.joints) if "ankle" in name]
+    calves = [i for i, name in enumerate(contract.joints) if "calf" in name]
     beyond = []
-    for _ in range(10):
+    for _ in range(25):
         commands = env.commands.numpy().copy()
         obs, *_ = env.step(act(policy, obs))
         targets, asked = controller.act(stage.measured, commands), env.actuators.targets.numpy()
         stage.step(commands)
         np.testing.assert_allclose(controller.last_targets, asked, atol=1e-3)
         np.testing.assert_allclose(targets, np.clip(asked, *env.robot.physics.actuator_ctrlrange.T), atol=1e-3)
-        beyond.append(np.abs(targets - asked)[:, ankles].max())
-    assert min(beyond) > 0.002 and max(beyond) > 0.005  # [rad]
+        beyond.append(np.abs(targets - asked)[:, calves].max())
+    assert max(beyond) > 0.005  # [rad]
 
 
 def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) -> None:
