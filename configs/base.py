@@ -79,16 +79,17 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
 
 
 class TrotCfg(SimToRealCfg):
-    """A quadruped that trots, on robots whose motors differ much. A clock tells left from right, history shows delays.
+    """A quadruped that trots, on robots whose motors differ much. A clock tells left from right.
 
     Numbers without a source: [ours: docs/fit.md].
     """
 
     class gait(SimToRealCfg.gait):
-        period, offsets = 0.5, [0.0, 0.5, 0.5, 0.0]  # [s], of front right, front left, rear right, rear left
+        period = 0.5  # [s]
+        offsets = [0.0, 0.5, 0.5, 0.0]  # [-] of front right, front left, rear right, rear left
 
     class observations(SimToRealCfg.observations):
-        history = {"state": 5}  # with one frame it walks up to 0.11 m/s too fast without delay
+        history = {"state": 5}  # with one frame it follows less exactly on each robot that was tried
 
     class commands(SimToRealCfg.commands):
         end_probability = 0.1
@@ -97,7 +98,7 @@ class TrotCfg(SimToRealCfg):
         tracking_sigma_end = 0.03
 
         class scales(SimToRealCfg.rewards.scales):
-            contact_phase = 0.3  # without it, delay changes its pace
+            contact_phase = 0.3  # for the clock's pace; a delay still changes it on the spot
             feet_impact_vel = -0.4
             target_limits = -1.0
             stand_still = -1.5
@@ -105,7 +106,9 @@ class TrotCfg(SimToRealCfg):
             termination = -100.0
 
     class domain_rand(SimToRealCfg.domain_rand):
-        friction, base_mass, delay_ms = [0.3, 1.2], [-1.0, 3.0], [0.0, 20.0]  # [-], [kg] of a Go2, [ms]
+        friction = [0.3, 1.2]  # [-]
+        base_mass = [-1.0, 3.0]  # [kg] of a Go2
+        delay_ms = [0.0, 20.0]  # [ms]
 
 
 class SimToRealRoughCfg(SimToRealCfg):

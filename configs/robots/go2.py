@@ -50,10 +50,10 @@ class WalkingGo2(Go2, LeggedRobotCfg):
 
 
 class RandomGo2(WalkingGo2):
-    """From the scene's numbers to the published ones of a real Go2 (docs/fit.md)."""
+    """Motors of up to about a real Go2's published numbers (docs/fit.md); a calf's armature begins at 0.018, not 0.01."""
 
     class asset(WalkingGo2.asset):
-        armature = {"hip": 0.0135, "thigh": 0.015, "calf": 0.03}  # [kg m^2] the middle
+        armature = {"hip": 0.0135, "thigh": 0.015, "calf": 0.03}  # [kg m^2] between go2.xml's and the published
 
     class domain_rand(WalkingGo2.domain_rand):
         armature, frictionloss, damping = [0.6, 1.75], [0.8, 3.5], [0.9, 1.8]  # [-]

@@ -124,7 +124,7 @@ class Fleet:
         # (N, nq) view: position [m], quaternion, joints in MuJoCo's order
         self.qpos: Floats = self._batch.bind("qpos")
         self.qvel: Floats = self._batch.bind("qvel")  # (N, nv) view; the next step starts from the written values
-        # (N, nv) of the last physics step, and a copy: `forward` leaves in it what a thread stepped last
+        # (N, nv) of the last physics step. `forward` overwrites it with another robot's, so _driven is a copy
         self._forces: Floats = self._batch.bind("qfrc_actuator")
         self._driven = self._forces.copy()
         self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
@@ -169,7 +169,7 @@ class Fleet:
             self.refresh()
 
     def motor_torque(self) -> Floats:
-        """(N, D) [N m] torque of each motor in the last physics step, including a servo's damping."""
+        """(N, D) [N m] torque of each motor in the last physics step, with a servo's damping at the present speed."""
         damping = self.contract.damping if self.damps_by_joint else 0.0
         return self._driven[:, self._dofs] - damping * self.qvel[:, self._dofs]
 

@@ -62,7 +62,7 @@ class GetupCfg(SkillCfg):
 
     class rewards(SkillCfg.rewards):
         only_positive_rewards = False  # [ours, P True: no fall ends an episode, and thrashing would cost nothing]
-        soft_power: Positive = 700.0  # of all joints together, of `power` [W] [ours: a G1's, which took 3.2 kW]
+        soft_power: Positive = 700.0  # of all joints together, of `power` [W] [ours: of a G1, with bursts of 3.2 kW]
         soft_acceleration: Positive = 1.5  # of the IMU, of `shock`, in multiples of 9.81 m/s^2 [-] [ours: 1 at rest]
 
         class scales(SkillCfg.rewards.scales):  # [P], with our terms of the same meaning
