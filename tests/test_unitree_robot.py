@@ -114,7 +114,7 @@ def test_a_g1_names_its_motors_error(domain: int) -> None:
 
 def test_a_bias_is_measured_and_not_there(domain: int) -> None:
     both = pair("go2_flat", domain, faults=Faults(joint_bias=0.03, gyro_bias=0.5))
-    both.steps(0.5)
+    both.steps(2.0)  # its legs hang still by then
     measured = both.robot.read()
     assert np.allclose(measured.joint_pos - both.sim.joint_pos, 0.03, atol=1e-3)
     assert np.allclose(measured.ang_vel - both.sim.data.qvel[3:6], 0.5, atol=0.05)
