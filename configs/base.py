@@ -89,7 +89,7 @@ class TrotCfg(SimToRealCfg):
         offsets = [0.0, 0.5, 0.5, 0.0]  # [-] of front right, front left, rear right, rear left
 
     class observations(SimToRealCfg.observations):
-        history = {"state": 5}  # with one frame it follows less exactly on each robot that was tried
+        history = {"state": 5}  # with one frame it follows the common range less exactly on each robot that was tried
 
     class commands(SimToRealCfg.commands):
         end_probability = 0.1
