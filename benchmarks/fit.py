@@ -1,7 +1,7 @@
 """How well legged-mw fit finds the numbers of a robot: simulated ones whose numbers were changed, over the real wire.
 
     python -m benchmarks.fit go2_flat --seed 0
-    python -m benchmarks.fit g1_flat --seed 1 --delay 6 --leave_out waist
+    python -m benchmarks.fit g1_flat --seed 1 --delay 6
 
 A robot of random numbers, with noisy sensors, is served on loopback. legged-mw deploy --chirp drives it in a process
 of its own, and the log is fitted. The table has each joint's true numbers and what was found.

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from drivers import Script
@@ -18,6 +19,7 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.joint_check import LIFT, Moves
 from legged_mw.deploy.log import DriveLog, Log, LogError, read_log
+from legged_mw.deploy.other_root import between, motion_of, with_root
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
@@ -133,6 +135,55 @@ def own(values: Floats, new: Floats) -> Floats:
 
 def kept(rows: Callable[[int], slice]) -> Callable[[DriveLog], DriveLog]:
     return lambda log: replace(log, rows={name: each[rows(len(each))] for name, each in log.rows.items()})
+
+
+def test_a_robot_with_another_root_moves_as_before() -> None:
+    """A G1 from its torso: with the same motor torques, gravity and speeds its joints accelerate alike."""
+    folder = POLICIES / "g1_flat"
+    model = read_scene(folder, read_contract(folder)).model
+    torso = model.body("torso_link").id
+    assert between(model, torso) == ["waist_pitch_joint", "waist_roll_joint", "waist_yaw_joint"]
+    other, random = with_root(model, torso).compile(), np.random.default_rng(0)
+    for each in (model, other):
+        for off in ("ACTUATION", "CONTACT", "LIMIT"):
+            each.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{off}")
+        each.opt.gravity[:], each.dof_frictionloss[:] = model.opt.gravity, 0.0
+    data, seen, velocity = mujoco.MjData(model), mujoco.MjData(other), np.zeros(6)
+    data.qpos[:7], data.qpos[7:] = [0.3, -0.2, 1.0, 0.5, 0.5, -0.5, 0.5], random.uniform(-0.4, 0.4, model.nq - 7)
+    data.qvel[:], data.qfrc_applied[6:] = random.uniform(-1.0, 1.0, model.nv), random.uniform(-9.0, 9.0, model.nu)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, torso, velocity, 0)
+    seen.qpos[:7] = [*data.xpos[torso], *data.xquat[torso]]
+    seen.qvel[:6] = [*velocity[3:], *data.xmat[torso].reshape(3, 3).T @ velocity[:3]]
+    for i in range(1, model.njnt):
+        mine, theirs = model.joint(i), other.joint(model.joint(i).name)
+        seen.qpos[theirs.qposadr], seen.qvel[theirs.dofadr] = data.qpos[mine.qposadr], data.qvel[mine.dofadr]
+        seen.qfrc_applied[theirs.dofadr] = data.qfrc_applied[mine.dofadr]
+    mujoco.mj_forward(other, seen)
+    assert other.body_mass.sum() == pytest.approx(model.body_mass.sum())
+    for i in range(1, model.njnt):
+        mine, theirs = model.joint(i), other.joint(model.joint(i).name)
+        assert seen.qacc[theirs.dofadr] == pytest.approx(data.qacc[mine.dofadr], rel=1e-6, abs=1e-6)
+
+
+def test_the_motion_of_another_body_is_found() -> None:
+    """Of a G1's torso, from random angles, speeds and accelerations, beside the second difference of its place."""
+    folder = POLICIES / "g1_flat"
+    model = read_scene(folder, read_contract(folder)).model
+    torso, data, random, step = model.body("torso_link").id, mujoco.MjData(model), np.random.default_rng(0), 1e-4
+    angle, speed = random.uniform(-0.5, 0.5, model.nu), random.uniform(-1.0, 1.0, model.nv)
+    slope, places, turned = random.uniform(-5.0, 5.0, model.nv), list[Floats](), np.eye(3)
+    speed[:3] = 0.0  # as in motion_of
+    for time in (-step, 0.0, step):
+        data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *angle]
+        mujoco.mj_integratePos(model, data.qpos, time * speed + 0.5 * time**2 * slope, 1.0)
+        mujoco.mj_kinematics(model, data)
+        places.append(data.xpos[torso].copy())
+        turned = data.xmat[torso].reshape(3, 3).copy() if time == 0.0 else turned
+    moved = (angle[None], speed[None, 6:], slope[None])
+    motion, spin = motion_of(model, torso, [*range(1, model.njnt)], moved, speed[None, 3:6], step)
+    wanted = (places[0] - 2.0 * places[1] + places[2]) / step**2
+    assert turned @ motion[0, :3] == pytest.approx(wanted, abs=1e-3) and np.abs(spin).max() > 0.1
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
 """Fit the parameters of each joint to the log of a chirp: delay, armature, friction, damping, gain, encoder offset.
 
 Each sweep is simulated in MuJoCo's C engine, with the bodies that the joint moves and the bodies that carry it. The
-root follows the IMU and the other joints follow their measured angles, so the robot may swing on its rope.
-mujoco.minimize.least_squares minimizes the error of angles and speeds.
+root follows the IMU and the other joints follow their measured angles, so the robot may swing on its rope. Joints
+between the IMU and the rope carry what is below them (other_root.py). mujoco.minimize.least_squares minimizes the
+error of angles and speeds.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from mujoco.rollout import Rollout
 from legged_mw.deploy.chirp import REST, SLOWEST
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.log import DriveLog, LogError, read_log
+from legged_mw.deploy.other_root import between, motion_of, with_root
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.states import CHIRP, STATES
@@ -137,7 +139,15 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
             raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
     selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
     sweeps = read_sweeps(path, recording, contract, scene.model, selected)
-    fitted = [_fit_joint(Chain(scene.spec, contract, sweep)) for sweep in sweeps]
+    hangs = int(np.argmax(scene.model.body_mass))  # the heaviest body, such as a G1's torso
+    turned, other = between(scene.model, hangs), with_root(scene.model, hangs)
+    fitted = list[FittedJoint]()
+    for sweep in sweeps:
+        if contract.joints[sweep.joint] in turned:
+            chain = Chain(other, contract, _seen_from(sweep, contract, scene.model, hangs))
+        else:
+            chain = Chain(scene.spec, contract, sweep)
+        fitted.append(_fit_joint(chain))
     _check_explained(path, contract.joints, fitted)
     return Fit(contract, recording, fitted, time.monotonic() - began)
 
@@ -230,6 +240,17 @@ def _smooth(values: Floats) -> Floats:
 def _difference(values: Floats) -> Floats:
     """Difference of each row to the next row (T, K). The last one is 0."""
     return np.diff(values, axis=0, append=values[-1:])
+
+
+def _seen_from(sweep: Sweep, contract: Contract, model: mujoco.MjModel, body: int) -> Sweep:
+    """The sweep with the motion of ``body`` (id) in place of the root's."""
+    step, joints = sweep.time[1], [model.joint(name).id for name in contract.joints]
+    gained = step * np.cumsum(sweep.slope[:-1, 3:6], axis=0)
+    turns = sweep.spin[3:6] + np.concatenate([np.zeros((1, 3)), gained])
+    moved = (sweep.angle, _smooth(sweep.speed), sweep.slope)
+    motion, spin = motion_of(model, body, joints, moved, turns, step)
+    slope = np.concatenate([motion, sweep.slope[:, 6:]], axis=1)
+    return sweep._replace(slope=slope, spin=np.concatenate([np.zeros(3), spin, sweep.spin[6:]]))
 
 
 def _root_motion(
