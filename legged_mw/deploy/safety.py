@@ -68,7 +68,7 @@ class Limits:
     lowest: Floats
     highest: Floats  # (D,) [rad]
     position: float = 0.25  # [rad] measured angle beyond the range [0.23: simulated joint limits are soft]
-    target: float = 0.9  # [rad] target beyond the range [0.62]
+    target: float = 0.9  # [rad] target beyond the range [0.59]
     step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.99]
     torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.67; go1_rough_scan 2.26, pushed]
     speed: float = 60.0  # [rad/s] joint speed [53]
