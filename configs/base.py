@@ -363,7 +363,7 @@ class LevelBipedRoughCfgPPO(LevelBipedCfgPPO):
         gamma = 0.99  # [legged_gym]
 
     class warm_start(LevelBipedCfgPPO.warm_start):
-        init_std = 0.5  # more than 0.2: g1_flat never lifts a foot onto a step
+        init_std = 0.5  # [ours: to find steps]
 
 
 class BipedGetupCfg(GetupCfg):

@@ -45,8 +45,8 @@ PATIENCE, LONGEST = 2.0, 15.0  # ours: time limit / time of the exam's robot; ti
 # (docs/first_walk.md)
 TILT, BEYOND, MOVED, LEFT = 15.0, 0.25, 0.05, 1.5  # [deg]; [rad]; [rad]; [N m] while damped
 ASIDE, HEADING, YAW, TIME = 0.25, 20.0, 0.1, 0.3  # [m]; [deg]; [rad/s]; [s]
-CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; share of its yaw rate and torques
-PACE = 0.5  # share of its times: with 10 ms of delay a right go2_flat takes its steps in 0.7 of the time
+CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; share of its yaw rate, time of a metre and torques
+PACE = 0.5  # share of its time of ten steps: with 10 ms of delay a right go2_flat takes 0.7 of it
 STANDS, WALKS = 0.1, 0.07  # share of the motor's largest torque: in the stand; while the policy runs
 SHORT = 1.0  # [N m] the torque may be less than requested by this, or by SHARE of it
 
@@ -276,7 +276,7 @@ class FirstWalk(JointCheck):
             measured, self._velocity(ang_vel_yaw=TURN), lambda: self._walked.steps >= COUNT, done
         )
         self._compare("yaw rate", "rad/s", np.mean(self._walked.turn), YAW, SHARE)
-        self._compare_walk(done)
+        self._compare_walk(done, PACE)
         return (yield from self._rest(measured))
 
     def _a_metre(self, measured: Measurement) -> Generator[Order, Measurement, Measurement]:
@@ -292,7 +292,7 @@ class FirstWalk(JointCheck):
         )
         self._compare("to the left", "m", self._walked.path(period)[1], ASIDE)
         self._compare("turned", "deg", math.degrees(sum(self._walked.turn) * period), HEADING)
-        self._compare_walk(done)
+        self._compare_walk(done, SHARE)
         return measured
 
     # ---- parts of the steps
@@ -357,8 +357,8 @@ class FirstWalk(JointCheck):
 
     # ---- comparison with the exam's robot
 
-    def _compare_walk(self, timed: str) -> None:
-        self._compare(timed, "s", self._lasted, TIME, PACE)
+    def _compare_walk(self, timed: str, share: float) -> None:
+        self._compare(timed, "s", self._lasted, TIME, share)
         self._compare(
             "torque, rms",
             "N m",

@@ -140,7 +140,8 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
     selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
     sweeps = read_sweeps(path, recording, contract, scene.model, selected)
     hangs = int(np.argmax(scene.model.body_mass))  # the heaviest body, such as a G1's torso
-    turned, other = between(scene.model, hangs), with_root(scene.model, hangs)
+    turned = between(scene.model, hangs)
+    other = with_root(scene.model, hangs) if turned else scene.spec
     fitted = list[FittedJoint]()
     for sweep in sweeps:
         if contract.joints[sweep.joint] in turned:
@@ -242,13 +243,26 @@ def _difference(values: Floats) -> Floats:
     return np.diff(values, axis=0, append=values[-1:])
 
 
+def _attitudes(omega: Floats, step: float) -> Floats:
+    """(T, 4) attitude of the root, level at the start, from its angular velocity (T, 3), its frame."""
+    attitude = np.tile([1.0, 0.0, 0.0, 0.0], (len(omega), 1))
+    for i in range(1, len(omega)):
+        attitude[i] = attitude[i - 1]
+        mujoco.mju_quatIntegrate(attitude[i], omega[i], step)
+    return attitude
+
+
 def _seen_from(sweep: Sweep, contract: Contract, model: mujoco.MjModel, body: int) -> Sweep:
     """The sweep with the motion of ``body`` (id) in place of the root's."""
     step, joints = sweep.time[1], [model.joint(name).id for name in contract.joints]
+    dofs = [*range(6), *model.jnt_dofadr[joints]]
     gained = step * np.cumsum(sweep.slope[:-1, 3:6], axis=0)
-    turns = sweep.spin[3:6] + np.concatenate([np.zeros((1, 3)), gained])
-    moved = (sweep.angle, _smooth(sweep.speed), sweep.slope)
-    motion, spin = motion_of(model, body, joints, moved, turns, step)
+    omega = sweep.spin[3:6] + np.concatenate([np.zeros((1, 3)), gained])
+    qpos = np.tile(model.qpos0, (len(sweep.time), 1))
+    qvel, qacc = np.zeros((2, len(sweep.time), model.nv))
+    qpos[:, :3], qpos[:, 3:7], qpos[:, model.jnt_qposadr[joints]] = 0.0, _attitudes(omega, step), sweep.angle
+    qvel[:, dofs[3:]], qacc[:, dofs] = np.concatenate([omega, _smooth(sweep.speed)], axis=1), sweep.slope
+    motion, spin = motion_of(model, body, qpos, qvel, qacc)
     slope = np.concatenate([motion, sweep.slope[:, 6:]], axis=1)
     return sweep._replace(slope=slope, spin=np.concatenate([np.zeros(3), spin, sweep.spin[6:]]))
 
@@ -269,11 +283,10 @@ def _root_motion(
     angular_acceleration = _difference(omega) / step
     acceleration = np.append(acceleration[1:], acceleration[-1:], axis=0)  # mean since the last row
     root = acceleration @ turn.T - np.cross(angular_acceleration, position) - np.cross(omega, np.cross(omega, position))
-    quaternion, rotation, world = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(9), np.empty_like(root)
-    for i, after in enumerate(np.append(omega[1:], omega[-1:], axis=0)):
-        mujoco.mju_quat2Mat(rotation, quaternion)
+    rotation, world = np.zeros(9), np.empty_like(root)
+    for i, attitude in enumerate(_attitudes(omega, step)):
+        mujoco.mju_quat2Mat(rotation, attitude)
         world[i] = rotation.reshape(3, 3) @ root[i]
-        mujoco.mju_quatIntegrate(quaternion, after, step)
     return np.concatenate([world, angular_acceleration], axis=1), omega[0]
 
 

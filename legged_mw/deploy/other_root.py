@@ -31,7 +31,7 @@ def with_root(model: mujoco.MjModel, root: int) -> mujoco.MjSpec:
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
     spec = mujoco.MjSpec()
-    _add(spec, spec.worldbody, model, data, (root, 0))
+    _add(spec.worldbody, model, data, root)
     for i in range(model.nu):
         joint = model.joint(model.actuator_trnid[i, 0]).id
         motor = spec.add_actuator(name=model.actuator(i).name, target=model.joint(joint).name)
@@ -45,11 +45,8 @@ def _joints(model: mujoco.MjModel, body: int) -> range:
     return range(first, first + int(model.body_jntnum[body]))
 
 
-def _add(
-    spec: mujoco.MjSpec, parent: mujoco.MjsBody, model: mujoco.MjModel, data: mujoco.MjData, at: tuple[int, int]
-) -> None:
-    """Add a body, and all that it carries, to ``parent``. ``at``: the body, and the one that it hangs on; 0: none."""
-    body, carrier = at
+def _add(parent: mujoco.MjsBody, model: mujoco.MjModel, data: mujoco.MjData, body: int, carrier: int = 0) -> None:
+    """Add ``body`` (id), and all that it carries, to ``parent``. ``carrier``: the body that it hangs on; 0: none."""
     rotation, carried_by = data.xmat[body].reshape(3, 3), data.xmat[carrier].reshape(3, 3)
     quaternion = np.array([1.0, 0.0, 0.0, 0.0])
     if carrier:
@@ -69,46 +66,30 @@ def _add(
             added.actfrclimited, added.actfrcrange = int(model.jnt_actfrclimited[i]), model.jnt_actfrcrange[i]
     else:
         new.add_freejoint(name="root")
-    others = [i for i in range(1, model.nbody) if model.body_parentid[i] == body]
-    others += [int(model.body_parentid[body])] if model.body_parentid[body] else []
-    for other in others:
-        if other != carrier:
-            _add(spec, new, model, data, (other, body))
+    around = [*np.flatnonzero(model.body_parentid == body), model.body_parentid[body]]
+    for other in around:
+        if other not in (0, carrier):
+            _add(new, model, data, int(other), body)
 
 
-def motion_of(
-    model: mujoco.MjModel,
-    body: int,
-    joints: list[int],
-    moved: tuple[Floats, Floats, Floats],
-    turns: Floats,
-    step: float,
-) -> tuple[Floats, Floats]:
-    """(T, 6) acceleration of ``body`` (id) without gravity, and (3,) its angular velocity at the start.
+def motion_of(model: mujoco.MjModel, body: int, qpos: Floats, qvel: Floats, qacc: Floats) -> tuple[Floats, Floats]:
+    """(T, 6) acceleration of ``body`` (id), and (3,) its angular velocity at the start, from (T, nq), (T, nv), (T, nv).
 
-    Linear: in a world that is turned like the body at the start. Angular: body frame. ``moved``: angles and speeds
-    (T, D) of the ``joints`` (ids), and accelerations (T, 6 + D) of the root and of them, as a Sweep has. ``turns``
-    (T, 3): angular velocity of the root, its frame.
+    Linear: in a world that is turned like the body at the start. Angular: body frame.
     """
-    data, angles, dofs = mujoco.MjData(model), model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    angle, speed, slope = moved
-    quaternion, velocity, acceleration = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(6)
-    motion, gyro, start = np.empty((len(angle), 6)), np.empty((len(angle), 3)), np.eye(3)
-    for i in range(len(angle)):
-        data.qpos[:3], data.qpos[3:7], data.qpos[angles] = 0.0, quaternion, angle[i]
-        data.qvel[:3], data.qvel[3:6], data.qvel[dofs] = 0.0, turns[i], speed[i]
-        data.qacc[:6], data.qacc[dofs] = slope[i, :6], slope[i, 6:]
+    data, kind = mujoco.MjData(model), mujoco.mjtObj.mjOBJ_XBODY
+    velocity, acceleration = np.zeros((2, 6))
+    motion, start, spin = np.empty((len(qpos), 6)), np.eye(3), np.zeros(3)
+    for i, (data.qpos[:], data.qvel[:], data.qacc[:]) in enumerate(zip(qpos, qvel, qacc, strict=True)):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
         mujoco.mj_rnePostConstraint(model, data)
-        kind = mujoco.mjtObj.mjOBJ_XBODY
-        mujoco.mj_objectVelocity(model, data, kind, body, velocity, 0)
-        mujoco.mj_objectAcceleration(model, data, kind, body, acceleration, 0)
+        mujoco.mj_objectAcceleration(model, data, kind, body, acceleration, 0)  # as an accelerometer: less gravity
         rotation = data.xmat[body].reshape(3, 3)
-        start = rotation.copy() if i == 0 else start
+        if i == 0:
+            mujoco.mj_objectVelocity(model, data, kind, body, velocity, 0)
+            start, spin = rotation.copy(), rotation.T @ velocity[:3]
         motion[i, :3] = start.T @ (acceleration[3:] + model.opt.gravity)
-        gyro[i] = rotation.T @ velocity[:3]
-        mujoco.mju_quatIntegrate(quaternion, turns[min(i + 1, len(turns) - 1)], step)
-    motion[:, 3:] = np.diff(gyro, axis=0, append=gyro[-1:]) / step
-    return motion, gyro[0]
+        motion[i, 3:] = rotation.T @ acceleration[:3]
+    return motion, spin

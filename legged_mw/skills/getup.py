@@ -198,8 +198,7 @@ class Getup(RobotTask):
 
         At most 64. A burst costs more than the same energy given evenly, which `energy` does not tell apart.
         """
-        power = (self.dof_vel * self.torques).abs().sum(dim=1)
-        return (power / self.cfg.rewards.soft_power - 1.0).clamp(0.0, 8.0).square()
+        return (self._reward_energy() / self.cfg.rewards.soft_power - 1.0).clamp(0.0, 8.0).square()
 
     def _reward_shock(self) -> Tensor:
         """Square of the IMU's proper acceleration beyond ``rewards.soft_acceleration``, both in g [-]. [ours]
