@@ -199,6 +199,15 @@ def test_a_scale_of_the_unusual_sign_is_named(name: str, scale: float) -> None:
     assert f"rewards.scales.{name} is {scale:g}" in line
 
 
+def test_a_cost_of_a_skill_has_the_sign_of_a_cost() -> None:
+    task = load_task("g1_getup")
+    task.set("rewards.scales.shock", -0.4)
+    assert lines_on(task) == []
+    task.set("rewards.scales.power", 1.0)
+    [line] = lines_on(task)
+    assert "below 0" in line
+
+
 def test_a_term_of_a_users_own_has_any_sign(tmp_path: Path) -> None:
     task = mine(tmp_path, "def _reward_torques(self):\n    return -self.torques.square().sum(dim=1)")
     task.set("rewards.scales.torques", 1.0)

@@ -17,11 +17,12 @@ HOOKS = (  # the parents' methods are needed in every step or reset; hooks of co
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
 )
 WITHOUT = "# without super"  # a comment in a method that intentionally does not call its parent's
-# Terms of RobotTask and LeggedRobot with a positive usual scale; their other terms are costs. Not a skill's terms.
+# Terms of RobotTask and LeggedRobot with a positive usual scale; their other terms are costs
 PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )
+COSTS = ("power", "shock")  # of skills; a skill's other terms pay
 # Methods of a class ported from legged_gym that nothing here calls -> method that is called. docs/from_legged_gym.md
 LEGGED_GYM_METHODS: dict[str, str] = {
     "post_physics_step": "_step()",
@@ -75,7 +76,8 @@ def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str
         method = getattr(env_class, f"_reward_{name}", None)
         if method is None or not method.__module__.startswith("legged_mw."):
             continue
-        pays = name in PAYS or method.__qualname__.partition(".")[0] not in ("RobotTask", "LeggedRobot")
+        of_skill = method.__qualname__.partition(".")[0] not in ("RobotTask", "LeggedRobot")
+        pays = name in PAYS or (of_skill and name not in COSTS)
         if scale and pays != (scale > 0.0):
             usual = "above 0: it is what the robot should do" if pays else "below 0: it is what the robot should avoid"
             yield f"warning: rewards.scales.{name} is {scale:g}; its usual sign is {usual} (docs/tasks.md)"
