@@ -32,7 +32,7 @@ from legged_mw.utils.task import load_task
 
 BIPED, DT = "examples/toy_biped.py", 0.02
 LEFT, RIGHT = 0, 1
-TERMS = ("alive", "base_height", "dof_acc", "dof_vel", "fast_joints", "hip_pos")
+TERMS = ("alive", "base_height", "dof_acc", "dof_vel", "fast_joints", "hip_pos", "trunk_orientation")
 FEET = ("feet_distance", "single_stance", "feet_phase", "contact_phase", "no_fly", "feet_orientation")
 ON = {f"rewards.scales.{name}": 1.0 for name in (*TERMS, *FEET)} | {
     "rewards.base_height_target": 0.5,
@@ -168,6 +168,19 @@ def test_feet_orientation() -> None:
     )
     env.sim.xquat[:, bodies] = torch.tensor([[flat, flat], [rolled, turned], [rolled, rolled]])
     assert term(env, "feet_orientation") == pytest.approx([0.0, 0.25, 0.5], abs=1e-6)
+
+
+def test_trunk_orientation() -> None:
+    """Of the heaviest body, which is a torso above the waist: tilted by 30 degrees 0.25; turned about the vertical 0."""
+    env = make_env(3, {**QUIET, "rewards.scales.trunk_orientation": -1.0}, task="g1_flat")
+    torso = env.robot.id("body", "torso_link")
+    half = math.pi / 12
+    tilted, turned = [math.cos(half), 0.0, math.sin(half), 0.0], [0.6, 0.0, 0.0, 0.8]
+    env.sim.xquat[:, env.root_body] = torch.tensor(
+        [math.cos(0.4), math.sin(0.4), 0.0, 0.0]
+    )  # the pelvis does not count
+    env.sim.xquat[:, torso] = torch.tensor([[1.0, 0.0, 0.0, 0.0], tilted, turned])
+    assert term(env, "trunk_orientation") == pytest.approx([0.0, 0.25, 0.0], abs=1e-6)
 
 
 def test_flat_is_how_feet_stand_in_the_default_pose() -> None:

@@ -34,7 +34,7 @@ from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import BrokenWorlds, NonFinite, Statistics
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.joints import PARTIAL, some_joints
+from legged_mw.sim.joints import PARTIAL, posed, some_joints
 from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, standing_height
 from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT, SENSORS
@@ -605,6 +605,10 @@ class RobotTask(BaseTask):
                     raise ConfigError(f"rewards.mirror_joints: {what}")
             # (2, pairs) indices of joints
             self.mirror_pairs = torch.cat([torch.stack(pair) for pair in pairs], dim=1) if pairs else torch.empty(0)
+        if "trunk_orientation" in on:
+            self.trunk = int(np.argmax(robot.physics.body_mass))  # the heaviest body
+            level = posed(robot.physics, robot.pose).xmat[self.trunk].reshape(3, 3)
+            self.trunk_up = self._tensor(level[2]).expand(self.num_envs, 3)  # vertical in its frame, default pose
         if "torque_limits" in on:
             limited = bool(np.isfinite(robot.effort_range).any())
             require(limited, "torque_limits", "no joint has a force limit; write asset.effort")
@@ -641,6 +645,10 @@ class RobotTask(BaseTask):
     def _reward_orientation(self) -> Tensor:
         """Tilt: gravity's share in the body's plane, equal to the xy share of the body's z axis in the world. [L, P]"""
         return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_trunk_orientation(self) -> Tensor:
+        """Squared sine of the tilt of the heaviest body, such as a humanoid's torso; level in the default pose. [ours]"""
+        return quat_rotate(self.sim.xquat[:, self.trunk], self.trunk_up)[:, :2].square().sum(dim=1)
 
     def _reward_base_height(self) -> Tensor:
         """Squared error of the root's height above the ground from ``rewards.base_height_target`` [m^2]. [L; U -10]"""
