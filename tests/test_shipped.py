@@ -45,6 +45,25 @@ def trained(folder: Path) -> LoadedTask:
 
 
 @pytest.mark.parametrize(
+    "folder", [folder for folder in POLICIES if [*folder.glob("*_training.yaml")]], ids=lambda folder: folder.name
+)
+def test_the_files_of_its_further_trainings_give_its_config(folder: Path) -> None:
+    """second_training.yaml, then third_training.yaml, over the task; the length of a run and how often it saves aside."""
+    task = load_task(folder.name)
+    for file in sorted(folder.glob("*_training.yaml")):
+        task.update(load_yaml(file), where=file.name)
+    ran = trained(folder)
+    assert task.cfg.to_dict() == ran.cfg.to_dict()
+    ours, theirs = task.train.to_dict(), ran.train.to_dict()
+    lengths = ("max_iterations", "save_interval", "keep_checkpoints", "exam_interval", "experiment_name")
+    for config in (ours, theirs):
+        config["warm_start"].pop("policy")
+        for name in lengths:
+            config["runner"].pop(name)
+    assert ours == theirs
+
+
+@pytest.mark.parametrize(
     "folder", [folder for folder in POLICIES if folder not in SKILLED], ids=lambda folder: folder.name
 )
 def test_walks_and_both_formats_agree(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
