@@ -46,7 +46,7 @@ PATIENCE, LONGEST = 2.0, 15.0  # ours: time limit / time of the exam's robot; ti
 TILT, BEYOND, MOVED, LEFT = 15.0, 0.25, 0.05, 1.5  # [deg]; [rad]; [rad]; [N m] while damped
 ASIDE, HEADING, YAW, TIME = 0.25, 20.0, 0.1, 0.3  # [m]; [deg]; [rad/s]; [s]
 CARRIED, SHARE = 0.15, 0.3  # share of the exam's weight; share of its yaw rate, time of a metre and torques
-PACE = 0.5  # share of its time of ten steps: with 10 ms of delay a right go2_flat takes 0.7 of it
+PACE = 0.5  # share of its time of ten steps: with 20 ms of delay a right go2_flat takes 0.7 of it
 STANDS, WALKS = 0.1, 0.07  # share of the motor's largest torque: in the stand; while the policy runs
 SHORT = 1.0  # [N m] the torque may be less than requested by this, or by SHARE of it
 
