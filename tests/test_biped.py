@@ -181,6 +181,12 @@ def test_trunk_orientation() -> None:
     )  # the pelvis does not count
     env.sim.xquat[:, torso] = torch.tensor([[1.0, 0.0, 0.0, 0.0], tilted, turned])
     assert term(env, "trunk_orientation") == pytest.approx([0.0, 0.25, 0.0], abs=1e-6)
+    pose = {**load_task("g1_flat").cfg.init_state.default_joint_angles, "waist_pitch": 0.3}
+    env = make_env(
+        1, {**QUIET, "rewards.scales.trunk_orientation": -1.0, "init_state.default_joint_angles": pose}, task="g1_flat"
+    )
+    env.sim.xquat[:, torso] = torch.tensor([math.cos(0.15), 0.0, math.sin(0.15), 0.0])
+    assert term(env, "trunk_orientation") == pytest.approx([0.0], abs=1e-6), "level in the default pose"
 
 
 def test_flat_is_how_feet_stand_in_the_default_pose() -> None:

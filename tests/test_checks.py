@@ -18,9 +18,10 @@ from worlds import make_env
 from legged_mw import ROOT
 from legged_mw.check.own_class import LEGGED_GYM_METHODS, PAYS, WITHOUT, check_class
 from legged_mw.rl.iteration_log import FiniteCheck
+from legged_mw.rl.run_folder import update_from_run
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
-from legged_mw.utils.config import ConfigError, field_types
+from legged_mw.utils.config import ConfigError, field_types, load_yaml
 from legged_mw.utils.errors import StepError, in_short
 from legged_mw.utils.renamed import LEGGED_GYM_TENSORS
 from legged_mw.utils.task import LoadedTask, load_task, task_names
@@ -197,6 +198,13 @@ def test_a_scale_of_the_unusual_sign_is_named(name: str, scale: float) -> None:
     task.set(f"rewards.scales.{name}", scale)
     [line] = lines_on(task)
     assert f"rewards.scales.{name} is {scale:g}" in line
+
+
+@pytest.mark.parametrize("folder", sorted((ROOT / "resources/policies").glob("*/")), ids=lambda folder: folder.name)
+def test_no_policy_that_ships_was_warned_of(folder: Path) -> None:
+    task = load_task(folder.name)
+    update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
+    assert not [line for line in lines_on(task) if "usual sign" in line]
 
 
 def test_a_cost_of_a_skill_has_the_sign_of_a_cost() -> None:

@@ -48,9 +48,9 @@ def trained(folder: Path) -> LoadedTask:
     "folder", [folder for folder in POLICIES if [*folder.glob("*_training.yaml")]], ids=lambda folder: folder.name
 )
 def test_the_files_of_its_further_trainings_give_its_config(folder: Path) -> None:
-    """second_training.yaml, then third_training.yaml, over the task; the length of a run and how often it saves aside."""
+    """The files over the task, in their order; aside are what a run begins with, its length, exams and checkpoints."""
     task = load_task(folder.name)
-    for file in sorted(folder.glob("*_training.yaml")):
+    for file in sorted(folder.glob("*_training.yaml")):  # second, third
         task.update(load_yaml(file), where=file.name)
     ran = trained(folder)
     assert task.cfg.to_dict() == ran.cfg.to_dict()
