@@ -13,13 +13,12 @@ from drivers import Script
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.first_walk import JOINTS, METRE, STANDING, STEPS, STOPPING, FirstWalk, first_walk, rehearse
-from legged_mw.deploy.hard_exam import trunk_of
 from legged_mw.deploy.inputs import DriveInput
 from legged_mw.deploy.joint_check import LIFT
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.deploy.simulated import MujocoRobot
+from legged_mw.deploy.simulated import MujocoRobot, trunk_of
 from legged_mw.deploy.states import DAMPING, STAND
 from legged_mw.utils.errors import UserError
 from tests.wires import POLICIES

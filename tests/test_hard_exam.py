@@ -17,8 +17,8 @@ from legged_mw.deploy import __main__ as program
 from legged_mw.deploy import hard_exam
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.exam import contract_rules
-from legged_mw.deploy.hard_exam import apply_conditions, commands_of, look, run_conditions, trunk_of
-from legged_mw.deploy.simulated import Fleet
+from legged_mw.deploy.hard_exam import apply_conditions, commands_of, look, run_conditions
+from legged_mw.deploy.simulated import Fleet, trunk_of
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import hard, walking
 

@@ -27,7 +27,7 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.log import DriveLog, LogError, read_log
 from legged_mw.deploy.other_root import between, motion_of, with_root
 from legged_mw.deploy.robot import Floats
-from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.simulated import read_scene, trunk_of
 from legged_mw.deploy.states import CHIRP, STATES
 from legged_mw.utils.cli import Parser
 from legged_mw.utils.config import save_yaml
@@ -139,7 +139,7 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
             raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
     selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
     sweeps = read_sweeps(path, recording, contract, scene.model, selected)
-    hangs = int(np.argmax(scene.model.body_mass))  # the heaviest body, such as a G1's torso
+    hangs = trunk_of(scene.model)
     turned = between(scene.model, hangs)
     other = with_root(scene.model, hangs) if turned else scene.spec
     fitted = list[FittedJoint]()

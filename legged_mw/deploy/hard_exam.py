@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.robot import Floats, Measurement
-from legged_mw.deploy.simulated import Fleet, lowest_point
+from legged_mw.deploy.simulated import Fleet, lowest_point, trunk_of
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.user_scene import torque_limits
 from legged_mw.eval import hard
@@ -105,11 +105,6 @@ def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float, 
         return replace(measured, **{name: getattr(measured, name) + value for name, value in noise.items()})
 
     stage.disturb = disturb
-
-
-def trunk_of(model: mujoco.MjModel) -> int:
-    """The heaviest body: the trunk of a quadruped, the torso of a humanoid."""
-    return int(np.argmax(model.body_mass))
 
 
 def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:

@@ -64,6 +64,11 @@ def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity:
     data.qpos[2] -= min((lowest_point(model, data, geom) for geom in touching), default=0.0)
 
 
+def trunk_of(model: mujoco.MjModel) -> int:
+    """The heaviest body: the trunk of a quadruped, the torso of a humanoid."""
+    return int(np.argmax(model.body_mass))
+
+
 def lowest_point(model: Any, data: Any, geom: int) -> float:
     """Height [m] of the lowest point of ``geom``: exact for a sphere or capsule, else of its bounding box."""
     return float(data.geom_xpos[geom, 2]) - _reach(model, geom, data.geom_xmat[geom])

@@ -19,7 +19,7 @@ import numpy as np
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.robot import Floats, damped
 from legged_mw.deploy.safety import limits_of
-from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.simulated import read_scene, trunk_of
 from legged_mw.unitree.client import STEP
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.faults import NAN, SWAPS, Faults, Line
@@ -115,8 +115,7 @@ class SimulatedUnitree:
             WireMessage(LAYOUTS[self.machine.package, "LowState_"]),
         )
         self.reset()
-        # the body that hangs on the rope: the heaviest one with ``lift``, as a G1's torso
-        self._hung = int(np.argmax(self.model.body_mass)) if lift else 1
+        self._hung = trunk_of(self.model) if lift else 1  # the body that hangs on the rope
         self._height, self._weight = float(self.data.xpos[self._hung, 2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
         self._rope = 1.0 if self.hoist else 0.0  # current share of the rope's force
