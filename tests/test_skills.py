@@ -78,6 +78,20 @@ def test_episodes_begin_in_falls(go1: Getup) -> None:
     torch.testing.assert_close(go1.dof_pos[mask], go1.default_dof_pos.expand(3, -1))
 
 
+def test_a_fall_begins_again_until_the_robot_is_up() -> None:
+    """World 0 fell and is down, 1 fell and is up, 2 began standing and is down."""
+    env = make("go1_getup", falls__states=8, falls__again=1.0, falls__share=1.0)
+    fell, everyone = env.fell.clone(), torch.ones(4, dtype=torch.bool)
+    assert (fell > 0).all()
+    env.cfg.falls.share = 0.0
+    env.fell[2] = 0
+    env.up.copy_(torch.tensor([False, True, False, False]))
+    env.reset_envs(everyone)
+    assert env.fell.tolist() == [fell[0], 0, 0, fell[3]]
+    torch.testing.assert_close(env.sim.qpos[[0, 3]], env.fallen_qpos[fell[[0, 3]] - 1])
+    torch.testing.assert_close(env.dof_pos[1:3], env.default_dof_pos.expand(2, -1))
+
+
 def test_rewards_of_getup(go1: Getup) -> None:
     """Standing; upside down; level and low; one joint off by 0.2 rad; and a joint at 3 turns a second."""
     home = torch.tensor([*go1.start_place, 1.0, 0.0, 0.0, 0.0, *go1.robot.pose])

@@ -34,6 +34,7 @@ class GetupCfg(SkillCfg):
         states: Count = 2048  # number of states after falls; at most four per world are made [ours]
         seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
         seed: NonNegativeInt = 1  # the same seed makes the same falls; the exam has another
+        again: Share = 0.0  # chance that an episode which ends down is followed by one after the same fall [ours]
         pull: Share = 0.0  # lifting force, as a share of the weight; it decreases as robots learn [H 0.6]
         pull_on: str = ""  # lifted body; empty: the root (a robot with a heavy trunk then hangs head down)
         pull_fades: PositiveShare = 0.2  # decrease of the force when every world has ended an episode up [ours]
@@ -120,6 +121,7 @@ class Getup(RobotTask):
         falls = self.cfg.falls
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
+        self.fell = self.buffer(dtype=torch.long)  # (N,) which fall the episode began after, from 1; 0: standing
         self.up_height = 0.99 * self.start_place[2]  # [m] height of a standing root [P: 0.275 of 0.278]
         self.upright = self.buffer()  # (N,) cosine of the tilt
         self.up = self.buffer(dtype=torch.bool)  # (N,) true if the robot is as high and upright as a standing one
@@ -139,10 +141,18 @@ class Getup(RobotTask):
         return lifted
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Start in the default pose, or with probability ``falls.share`` in a state after a fall."""
+        """Start in the default pose, or with probability ``falls.share`` in a state after a fall.
+
+        With probability ``falls.again`` a robot that did not get up starts after the same fall again.
+        """
         super()._reset_robots(mask)
-        fall = mask & (torch.rand_like(self.rew_buf) < self.cfg.falls.share)
+        falls = self.cfg.falls
+        fall = mask & (torch.rand_like(self.rew_buf) < falls.share)
         pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)
+        if falls.again:
+            again = mask & (self.fell > 0) & ~self.up & (torch.rand_like(self.rew_buf) < falls.again)
+            fall, pick = fall | again, torch.where(again, self.fell - 1, pick)
+            assign(self.fell, mask, torch.where(fall, pick + 1, 0))
         assign(self.sim.qpos, fall, self.fallen_qpos.index_select(0, pick))
         assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
 
