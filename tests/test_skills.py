@@ -78,18 +78,26 @@ def test_episodes_begin_in_falls(go1: Getup) -> None:
     torch.testing.assert_close(go1.dof_pos[mask], go1.default_dof_pos.expand(3, -1))
 
 
-def test_a_fall_begins_again_until_the_robot_is_up() -> None:
-    """World 0 fell and is down, 1 fell and is up, 2 began standing and is down."""
+def test_a_fall_begins_again_until_the_robot_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the end of an episode. World 0 fell and is down, 1 fell and is up, 2 began standing, 3 fell and is broken."""
     env = make("go1_getup", falls__states=8, falls__again=1.0, falls__share=1.0)
-    fell, everyone = env.fell.clone(), torch.ones(4, dtype=torch.bool)
-    assert (fell > 0).all()
+    first = env.begun_in.clone()
+    assert (first > 0).all()
     env.cfg.falls.share = 0.0
-    env.fell[2] = 0
-    env.up.copy_(torch.tensor([False, True, False, False]))
-    env.reset_envs(everyone)
-    assert env.fell.tolist() == [fell[0], 0, 0, fell[3]]
-    torch.testing.assert_close(env.sim.qpos[[0, 3]], env.fallen_qpos[fell[[0, 3]] - 1])
-    torch.testing.assert_close(env.dof_pos[1:3], env.default_dof_pos.expand(2, -1))
+    env.begun_in[2] = 0
+    refresh = env.check_termination
+
+    def end() -> None:
+        refresh()
+        env.up.copy_(torch.tensor([False, True, False, False]))
+        env.broken.copy_(torch.tensor([False, False, False, True]))
+        env.reset_buf.fill_(True)
+
+    monkeypatch.setattr(env, "check_termination", end)
+    env.step(torch.zeros(4, env.num_actions))
+    assert env.begun_in.tolist() == [first[0], 0, 0, 0] and not env.fell.any()
+    torch.testing.assert_close(env.sim.qpos[0], env.fallen_qpos[first[0] - 1])
+    torch.testing.assert_close(env.dof_pos[1:], env.default_dof_pos.expand(3, -1))
 
 
 def test_rewards_of_getup(go1: Getup) -> None:

@@ -121,7 +121,7 @@ class Getup(RobotTask):
         falls = self.cfg.falls
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
-        self.fell = self.buffer(dtype=torch.long)  # (N,) which fall the episode began after, from 1; 0: standing
+        self.begun_in = self.buffer(dtype=torch.long)  # (N,) the fall that the episode began after, from 1; 0: standing
         self.up_height = 0.99 * self.start_place[2]  # [m] height of a standing root [P: 0.275 of 0.278]
         self.upright = self.buffer()  # (N,) cosine of the tilt
         self.up = self.buffer(dtype=torch.bool)  # (N,) true if the robot is as high and upright as a standing one
@@ -150,9 +150,10 @@ class Getup(RobotTask):
         fall = mask & (torch.rand_like(self.rew_buf) < falls.share)
         pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)
         if falls.again:
-            again = mask & (self.fell > 0) & ~self.up & (torch.rand_like(self.rew_buf) < falls.again)
-            fall, pick = fall | again, torch.where(again, self.fell - 1, pick)
-            assign(self.fell, mask, torch.where(fall, pick + 1, 0))
+            down = (self.begun_in > 0) & ~self.up & ~self.broken
+            again = mask & down & (torch.rand_like(self.rew_buf) < falls.again)
+            fall, pick = fall | again, torch.where(again, self.begun_in - 1, pick)
+            assign(self.begun_in, mask, torch.where(fall, pick + 1, 0))
         assign(self.sim.qpos, fall, self.fallen_qpos.index_select(0, pick))
         assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
 
