@@ -191,6 +191,11 @@ def test_buffers_are_never_rebound(env: Any) -> None:
     ] == []
 
 
+def test_no_buffer_takes_the_name_of_another(env: Any) -> None:
+    """A class that gives its own buffer a parent's name gets what the parent writes into it."""
+    assert [name for name in env.remembered() if name.partition(" ")[2].isdigit()] == []
+
+
 # ---- resets
 
 
