@@ -113,7 +113,7 @@ def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
 
 
 def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tmp_path: Path) -> None:
-    """Of go2_rough, whose policy asks its calves for more than their range; the scene is not there."""
+    """Of go2_rough, whose policy asks its calves for more than their range at times; the scene is not there."""
     seed_everything(0)  # two simulations of an arbitrary walk may part by more than is compared
     folder, task = ROOT / "resources/policies/go2_rough", load_task("go2_rough")
     update_from_run(task, load_yaml(folder / "config.yaml"), where="config.yaml")
