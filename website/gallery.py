@@ -17,8 +17,8 @@ from legged_mw import ROOT
 
 POLICIES, PAGE, IMAGES = ROOT / "resources/policies", ROOT / "docs/gallery.md", ROOT / "docs/images/gallery"
 ORDER = (  # then all others by name
-    *("go1_flat", "go1_rough", "go1_rough_scan", "go1_rough_student", "go2_flat", "go2_rough", "go2_rough_scan"),
-    *("g1_flat", "g1_12dof_flat", "g1_rough"),
+    *("go1_flat", "go1_flat_dr", "go1_rough", "go1_rough_scan", "go1_rough_student"),
+    *("go2_flat", "go2_rough", "go2_rough_scan", "g1_flat", "g1_12dof_flat", "g1_rough"),
 )
 FIRST = f"\n## {ORDER[0]}\n"  # what stands before it in docs/gallery.md is written by hand
 
