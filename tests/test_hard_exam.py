@@ -146,3 +146,18 @@ def test_in_the_exam_of_an_export(
     saved = json.loads((tmp_path / "exam.json").read_text())["hard"]
     assert list(saved["conditions"]) == NAMES and saved["load"] == 3.0 and math.isclose(saved["vx"], 1.0)
     assert "hard exam: 12 commands and 32 pushes" in capsys.readouterr().out
+
+
+def test_on_odometry_the_conditions_are_walked_by_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another walk than with the true velocity, under noise more than without."""
+    monkeypatch.setattr(hard, "SECONDS", 1.6)
+    monkeypatch.setattr(hard, "SETTLING", 0.8)
+    folder = ROOT / "resources/policies/go1_flat_dr"
+    contract = read_contract(folder)
+    truth, estimate = (
+        run_conditions(folder, contract, contract_rules(contract), 2.0, contact=contact) for contact in (None, "height")
+    )
+    apart = {
+        name: np.abs(np.subtract(estimate[name]["error"], truth[name]["error"]))[:2].sum() for name in ("none", "noise")
+    }
+    assert 0.0 < apart["none"] < apart["noise"]

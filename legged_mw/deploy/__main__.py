@@ -307,7 +307,7 @@ def examine(
         result = run_exam(folder, rules, contact=contact, edited=edited, scene=scene)
         print(walking.table(result))
         if hard and contract.feet:
-            result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene)
+            result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene, contact=contact)
             print(f"\n{table(result['hard'])}")
     if hard:
         result["heat"] = run_heat(folder, rules, edited, scene)

@@ -29,17 +29,23 @@ SEED = 1  # seed of the noise
 
 
 def run_hard(
-    folder: Path, rules: ExamRules, walks: bool, edited: bool = False, scene: str | Path = SCENE_FILE, seed: int = 0
+    folder: Path,
+    rules: ExamRules,
+    walks: bool,
+    edited: bool = False,
+    scene: str | Path = SCENE_FILE,
+    seed: int = 0,
+    contact: str | None = None,
 ) -> tuple[dict[str, Any], list[Floats]]:
     """The hard exam's result, and qpos (nq,) at PICTURES times of a stride; no qpos if the robot fell.
 
     ``walks``: the verdict of the walking exam. ``edited``: see read_contract. ``scene``: see Fleet. ``seed``: of the
-    noise and of the start (see ``scatter``). Raises ContractError, UserError.
+    noise and of the start (see ``scatter``). ``contact``: see DeployStage. Raises ContractError, UserError.
     """
     contract = read_contract(folder, edited)
     load = hard.load_of(rules, contract.mass)
-    conditions = run_conditions(folder, contract, rules, load, edited, scene, seed)
-    walk, poses = look(folder, contract, rules, edited, scene, seed)
+    conditions = run_conditions(folder, contract, rules, load, edited, scene, seed, contact)
+    walk, poses = look(folder, contract, rules, edited, scene, seed, contact)
     figures = hard.looks(walk) if walk else None
     return hard.finish(rules, walks, conditions, figures, len(contract.feet), load), poses
 
@@ -55,13 +61,14 @@ def run_conditions(
     edited: bool = False,
     scene: str | Path = SCENE_FILE,
     seed: int = 0,
+    contact: str | None = None,
 ) -> dict[str, Any]:
     """Condition -> falls, errors, drift and pushes. Each condition has its own worlds."""
     velocities = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
     count = len(velocities) * len(CONDITIONS)
     commands = commands_of(contract, velocities * len(CONDITIONS))
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
-    stage = DeployStage(folder, count, ends=ends, scene_file=scene, edited=edited)
+    stage = DeployStage(folder, count, ends=ends, contact=contact, scene_file=scene, edited=edited)
     stage.scatter(seed)
     apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(velocities)), load, seed)
     fell_at, velocity, position = np.full(count, math.inf), [], []
@@ -128,6 +135,7 @@ def look(
     edited: bool = False,
     scene: str | Path = SCENE_FILE,
     seed: int = 0,
+    contact: str | None = None,
 ) -> tuple[Walk | None, list[Floats]]:
     """Record a walk ahead at half of the highest vx, and the qpos of one stride. None if the robot falls."""
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
@@ -138,6 +146,7 @@ def look(
         threads=1,
         scene_file=scene,
         ends=ends,
+        contact=contact,
         change=_solve_well,
         edited=edited,
         each=lambda: recorder[0].sample(),

@@ -61,7 +61,7 @@ class DeployStage:
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()
         self._fell = np.zeros(num_worlds, dtype=bool)
-        self.disturb: Callable[[Measurement], Measurement] | None = None  # applied to the policy's measurement
+        self.disturb: Callable[[Measurement], Measurement] | None = None  # applied to what policy and odometry measure
         self.measured = self._seen = self.fleet.read()  # after the last step; input of the policy in the last step
 
     def step(self, commands: Floats | None = None) -> None:
@@ -69,9 +69,8 @@ class DeployStage:
         self._commands = (
             self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
         )
-        self._seen = self.odometry(self.measured) if self.odometry else self.measured
-        if self.disturb:
-            self._seen = self.disturb(self._seen)
+        seen = self.disturb(self.measured) if self.disturb else self.measured
+        self._seen = self.odometry(seen) if self.odometry else seen
         self.fleet.write(self.controller.act(self._seen, self._commands))
         self._fell = self.fleet.fell()
         if self._fell.any():
