@@ -310,7 +310,7 @@ def examine(
             result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene, contact=contact)
             print(f"\n{table(result['hard'])}")
     if hard:
-        result["heat"] = run_heat(folder, rules, edited, scene)
+        result["heat"] = run_heat(folder, rules, edited, scene, contact)
         print(f"\n{heat.table(result['heat'])}")
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"scene": shown(scene)} if isinstance(scene, Path) else {}

@@ -26,11 +26,15 @@ TRIES = 8  # number of robots in a skill exam
 
 
 def run_heat(
-    folder: Path, exam: ExamRules | Skill, edited: bool = False, scene: str | Path = SCENE_FILE
+    folder: Path,
+    exam: ExamRules | Skill,
+    edited: bool = False,
+    scene: str | Path = SCENE_FILE,
+    contact: str | None = None,
 ) -> dict[str, Any]:
     """The result of ``heat.finish``, for standing and walking, or for the motion of a skill.
 
-    ``edited``: see read_contract. ``scene``: see Fleet. Raises ContractError, UserError.
+    ``edited``: see read_contract. ``scene``: see Fleet. ``contact``: see DeployStage. Raises ContractError, UserError.
     """
     contract, walks = read_contract(folder, edited), isinstance(exam, ExamRules)
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on) if walks else None  # as in run_exam
@@ -41,6 +45,7 @@ def run_heat(
         threads=1,
         scene_file=scene,
         ends=ends,
+        contact=contact,
         edited=edited,
         each=lambda: log[0].sample(),
     )
