@@ -152,6 +152,7 @@ def test_on_odometry_the_conditions_are_walked_by_the_estimate(monkeypatch: pyte
     """Another walk than with the true velocity, under noise more than without."""
     monkeypatch.setattr(hard, "SECONDS", 1.6)
     monkeypatch.setattr(hard, "SETTLING", 0.8)
+    monkeypatch.setattr(hard, "PUSH_DIRECTIONS", 1)
     folder = ROOT / "resources/policies/go1_flat_dr"
     contract = read_contract(folder)
     truth, estimate = (
