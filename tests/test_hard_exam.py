@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -91,7 +92,7 @@ def test_all_conditions_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hard, "PUSH_AT", 0.3)
     monkeypatch.setattr(hard, "PUSH_OTHERS", 20.0)
     contract = read_contract(GO2)
-    found = run_conditions(GO2, contract, contract_rules(contract, common=True), 3.0)
+    found = run_conditions(partial(DeployStage, GO2), contract, contract_rules(contract, common=True), 3.0)
     assert list(found) == NAMES and all(each["falls"] == 0 for each in found.values())
     assert all(each["pushes"] < 0.5 for each in found.values())
     assert found["none"]["error"] != found["noise"]["error"] and found["none"]["drift"] < 0.01
@@ -101,7 +102,7 @@ def test_all_conditions_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_robot_is_looked_at(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hard_exam, "LOOK_SECONDS", 6.2)  # of these, 4.2 s: six strides of a G1
     contract = read_contract(folder)
-    walk, poses = look(folder, contract, contract_rules(contract, common=True))
+    walk, poses = look(partial(DeployStage, folder), contract, contract_rules(contract, common=True))
     assert walk and len(poses) == hard_exam.PICTURES
     found = hard.looks(walk)
     carried = walk.force.sum(axis=1).mean() / walk.weight
@@ -156,7 +157,8 @@ def test_on_odometry_the_conditions_are_walked_by_the_estimate(monkeypatch: pyte
     folder = ROOT / "resources/policies/go1_flat_dr"
     contract = read_contract(folder)
     truth, estimate = (
-        run_conditions(folder, contract, contract_rules(contract), 2.0, contact=contact) for contact in (None, "height")
+        run_conditions(partial(DeployStage, folder, contact=contact), contract, contract_rules(contract), 2.0)
+        for contact in (None, "height")
     )
     apart = {
         name: np.abs(np.subtract(estimate[name]["error"], truth[name]["error"]))[:2].sum() for name in ("none", "noise")

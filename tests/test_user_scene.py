@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -94,7 +95,7 @@ def test_its_conditions_and_its_looks(tmp_path: Path, monkeypatch: pytest.Monkey
     )
     assert soft.dof_damping[stage.fleet._dofs].ravel() == pytest.approx(0.1)  # the joints' own
     monkeypatch.setattr("legged_mw.deploy.hard_exam.LOOK_SECONDS", 4.0)
-    walk, _ = look(GO2, contract, contract_rules(contract, common=True), scene=file)
+    walk, _ = look(partial(DeployStage, GO2, scene_file=file), contract, contract_rules(contract, common=True))
     assert walk and walk.limit.tolist() == [23.0, 23.0, 45.0] * 4
     found = hard.looks(walk)
     assert walk.force.sum(axis=1).mean() / walk.weight == pytest.approx(1.0, abs=0.06)

@@ -62,7 +62,6 @@ FILM = [  # of the README, from left to right
 ]
 BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_flat": Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
-    "go1_flat_dr": Shot("go1_flat_dr", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
     **{
         name: FILM[0]._replace(policy=name)
         for name in ("go1_rough", "go1_rough_scan", "go1_rough_student", "go2_rough", "go2_rough_scan")

@@ -69,11 +69,11 @@ def films(names: Sequence[str]) -> None:
     """A film and a still of each."""
     from PIL import Image
 
-    from website.film import BY_NAME, Shot, record, save_webp
+    from website.film import BY_NAME, record, save_webp
 
     IMAGES.mkdir(parents=True, exist_ok=True)
     for name in names:
-        shot = BY_NAME.get(name, Shot(name, BY_NAME["go1_flat"].command))
+        shot = BY_NAME.get(name, BY_NAME["go1_flat"]._replace(policy=name))
         frames = record(shot._replace(seconds=min(shot.seconds, 2.4)), 256, 160)
         save_webp(IMAGES / f"{name}.webp", frames)
         Image.fromarray(frames[len(frames) // 2]).save(IMAGES / f"{name}.jpg", quality=70, optimize=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -44,8 +45,9 @@ def run_hard(
     """
     contract = read_contract(folder, edited)
     load = hard.load_of(rules, contract.mass)
-    conditions = run_conditions(folder, contract, rules, load, edited, scene, seed, contact)
-    walk, poses = look(folder, contract, rules, edited, scene, seed, contact)
+    make = partial(DeployStage, folder, edited=edited, scene_file=scene, contact=contact)
+    conditions = run_conditions(make, contract, rules, load, seed)
+    walk, poses = look(make, contract, rules, seed)
     figures = hard.looks(walk) if walk else None
     return hard.finish(rules, walks, conditions, figures, len(contract.feet), load), poses
 
@@ -54,21 +56,17 @@ def run_hard(
 
 
 def run_conditions(
-    folder: Path,
-    contract: Contract,
-    rules: ExamRules,
-    load: float,
-    edited: bool = False,
-    scene: str | Path = SCENE_FILE,
-    seed: int = 0,
-    contact: str | None = None,
+    make: Callable[..., DeployStage], contract: Contract, rules: ExamRules, load: float, seed: int = 0
 ) -> dict[str, Any]:
-    """Condition -> falls, errors, drift and pushes. Each condition has its own worlds."""
+    """Condition -> falls, errors, drift and pushes. Each condition has its own worlds.
+
+    ``make``: DeployStage with folder, scene and source of velocity given.
+    """
     velocities = [*hard.commands(rules), *[(hard.half_speed(rules), 0.0, 0.0)] * hard.PUSH_DIRECTIONS]
     count = len(velocities) * len(CONDITIONS)
     commands = commands_of(contract, velocities * len(CONDITIONS))
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
-    stage = DeployStage(folder, count, ends=ends, contact=contact, scene_file=scene, edited=edited)
+    stage = make(count, ends=ends)
     stage.scatter(seed)
     apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(velocities)), load, seed)
     fell_at, velocity, position = np.full(count, math.inf), [], []
@@ -129,28 +127,15 @@ def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
 
 
 def look(
-    folder: Path,
-    contract: Contract,
-    rules: ExamRules,
-    edited: bool = False,
-    scene: str | Path = SCENE_FILE,
-    seed: int = 0,
-    contact: str | None = None,
+    make: Callable[..., DeployStage], contract: Contract, rules: ExamRules, seed: int = 0
 ) -> tuple[Walk | None, list[Floats]]:
-    """Record a walk ahead at half of the highest vx, and the qpos of one stride. None if the robot falls."""
+    """Record a walk ahead at half of the highest vx, and the qpos of one stride. None if the robot falls.
+
+    ``make``: see run_conditions.
+    """
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)
     recorder: list[Witness] = []
-    stage = DeployStage(
-        folder,
-        1,
-        threads=1,
-        scene_file=scene,
-        ends=ends,
-        contact=contact,
-        change=_solve_well,
-        edited=edited,
-        each=lambda: recorder[0].sample(),
-    )
+    stage = make(1, threads=1, ends=ends, change=_solve_well, each=lambda: recorder[0].sample())
     recorder.append(Witness(stage.fleet))  # before scatter, because the feet must be level
     stage.scatter(seed)
     commands = commands_of(contract, [(hard.half_speed(rules), 0.0, 0.0)])
