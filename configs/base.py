@@ -107,7 +107,7 @@ class TrotCfg(SimToRealCfg):
 
     class domain_rand(SimToRealCfg.domain_rand):
         friction = [0.3, 1.2]  # [-]
-        base_mass = [-1.0, 3.0]  # [kg] of a Go2
+        base_mass = [-1.0, 3.0]  # [kg] of a robot of a Go2's size
         delay_ms = [0.0, 20.0]  # [ms]
 
 

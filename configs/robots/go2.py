@@ -56,4 +56,6 @@ class RandomGo2(WalkingGo2):
         armature = {"hip": 0.0135, "thigh": 0.015, "calf": 0.03}  # [kg m^2] between go2.xml's and the published
 
     class domain_rand(WalkingGo2.domain_rand):
-        armature, frictionloss, damping = [0.6, 1.75], [0.8, 3.5], [0.9, 1.8]  # [-]
+        armature, frictionloss = [0.6, 1.75], [0.8, 3.5]  # [-]
+        stiffness, damping = [0.8, 1.2], [0.8, 1.8]  # [-] from 0.8 and to 1.2 as in the hard exam
+        base_mass = [-1.0, 4.0]  # [kg]
