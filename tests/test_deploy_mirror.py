@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import socket
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,7 +23,9 @@ from legged_mw.deploy.mirror import ACTIONS, MirroredStage, MirrorSession, Robot
 from legged_mw.deploy.robot import Health, Measurement
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.view.drive import Pilot
+from legged_mw.view.panel import Panel
 from legged_mw.view.stage import Moment, ViewError
+from legged_mw.view.stream import Stream
 from legged_mw.view.web import free_port, missing
 
 GO2 = ROOT / "resources/policies/go2_flat"
@@ -155,6 +158,25 @@ def test_the_button_damps_and_nothing_else_is_asked(ends: Ends) -> None:
     wish = ends.mirror.poll(Health())
     assert wish.stop == "the viewer's button" and wish.command is None and not wish.pressed
     assert not ends.pilot.driving and not ends.pilot.paused and ends.mirror.poll(Health()).stop == ""
+
+
+def test_any_page_of_a_real_robot_may_damp_it(ends: Ends) -> None:
+    """Also one that came second: nobody drives there, so nobody drives alone."""
+    stream = Stream(None, Panel(ends.pilot, "robot", None, None))  # type: ignore[arg-type]
+    stream._watching[object()] = time.monotonic()  # the first page
+    assert stream._obey(json.dumps(["click", "reset"]), stream._drives(object(), ""))
+    ends.session.turn()
+    assert ends.mirror.poll(Health()).stop == "the viewer's button"
+
+
+def test_what_is_shown_is_called_old_if_the_program_is_silent(
+    ends: Ends, contract: Contract, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends.mirror.show(0.0, measurement(contract), state("policy", ""))
+    assert "old" not in ends.turn()
+    later = time.monotonic() + 3.0
+    monkeypatch.setattr(time, "monotonic", lambda: later)
+    assert ends.turn()["old"].startswith("the robot's program has sent nothing for 3.")
 
 
 def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:

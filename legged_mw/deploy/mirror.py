@@ -37,6 +37,7 @@ START = 30.0  # [s] time limit for a viewer to open
 # the only actions and their labels; "": the label of BINDINGS
 ACTIONS = {"reset": "Damp", "camera": "", "help": ""}
 DAMP = b"damp"
+SILENT = 0.5  # [s] without a message: the page says that what it shows is old
 _PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # fields of a measurement
 FLAGS = ("viewer", "camera", "host", "port")
 LIVE = ("native", "web")  # live values of --viewer
@@ -95,7 +96,7 @@ class RobotMonitor:
             "note": states.note,
             "command": states.command.tolist() if states.state == POLICY else None,
         }
-        message |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage, "age": health.age_s}
+        message |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage}
         message["hottest"] = None if health.temperatures is None else float(health.temperatures.max())
         if measured is not None:
             message |= {name: getattr(measured, name).tolist() for name in _PARTS}
@@ -139,6 +140,7 @@ class MirroredStage:
             )
         ]
         self.latest: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
+        self._heard = time.monotonic()  # [s] time of the newest message
 
     def step(self, commands: Floats | None) -> None:
         """Read the newest message. Exit if the robot's program has ended."""
@@ -150,11 +152,15 @@ class MirroredStage:
             raise SystemExit
         if newest is None:
             return
-        self.latest |= newest
+        self.latest, self._heard = self.latest | newest, time.monotonic()
         if "joint_pos" in newest and np.isfinite([*newest["joint_pos"], *newest["gravity"]]).all():
             self._data.qpos[:2] = newest["place"][:2]
             angles, gravity = np.array(newest["joint_pos"]), np.array(newest["gravity"])
             place(self._model, self._data, self.contract.joints, angles, gravity, newest["place"][2])
+
+    def silent(self) -> float:
+        """Time [s] since the newest message."""
+        return time.monotonic() - self._heard
 
     def commands(self) -> Floats:
         return np.array([self.latest["command"] or [each.default for each in self.command_table]])
@@ -211,6 +217,8 @@ class MirrorSession(Session):
             ("time", "time", "{:.1f} s"),
         ):
             lines += [(name, form.format(latest[key]))] if latest.get(key) is not None else []
+        if (silent := self.stage.silent()) > SILENT:
+            lines.insert(0, ("old", f"the robot's program has sent nothing for {silent:.1f} s"))
         return tuple(lines)
 
 

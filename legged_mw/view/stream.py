@@ -112,7 +112,9 @@ class Stream:
                 sender.cancel()
 
     def _drives(self, socket: Any, session: str) -> bool:
-        """Whether this page drives. Of Studio's pages, the accepted one drives."""
+        """Whether this page drives. Of Studio's pages, the accepted one drives. Where none can drive, each may ask."""
+        if "own" not in self._panel.pilot.can:  # a real robot's pages: any of them may damp it
+            return True
         controller = self._controller()
         return socket is self._first() if controller is None else session == controller
 
