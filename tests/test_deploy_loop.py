@@ -45,6 +45,7 @@ def test_a_late_step_moves_no_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     with Loop(0.02) as loop:
         for _ in loop.ticks(0.2):
             began.append(round(clock.now - 100.0, 6))
+            assert loop.skipped == (began[-1] == 0.115)
             clock.pass_({1: 0.031, 3: 0.055}.get(len(began) - 1, 0.002))
     assert began == [0.0, 0.02, 0.051, 0.06, 0.115, 0.12, 0.14, 0.16, 0.18]
     timing = loop.timing()

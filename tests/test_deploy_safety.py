@@ -196,6 +196,10 @@ def test_steps_that_are_late(contract: Contract, limits: Limits) -> None:
     safety = Safety(contract, off)
     found = [safety.sensed(at_rest(contract), Health(), i * 0.02, 0.015) for i in range(5)]
     assert found[-1] == Trip("late", "5 steps within a second began late, the last by 15 ms")
+    safety = Safety(contract, off)  # a program that hangs, and goes on punctually
+    assert safety.sensed(at_rest(contract), Health(), 0.1, 0.0, 3) is None
+    trip = safety.sensed(at_rest(contract), Health(), 0.5, 0.0, 2)
+    assert trip == Trip("late", "5 steps within a second began late, or not at all: 2 before this one")
 
 
 def test_measurements_that_are_frozen(contract: Contract, limits: Limits) -> None:
@@ -320,6 +324,7 @@ def test_limits_of_an_export(contract: Contract) -> None:
     narrow = replace(contract, safety={"speed": 25, "tilt": False})
     limits = Limits.of(GO2, narrow, {"voltage": 24.0}, parse_limits(["speed=30", "late = off"]))
     assert (limits.speed, limits.tilt, limits.voltage, limits.late) == (30.0, math.inf, 24.0, math.inf)
+    assert [Limits.of(GO2, contract, {"target": zero}).target for zero in (0, 0.0, "0", False)] == [0, 0, 0, math.inf]
     for falls, tilt in ((None, math.inf), (45.0, 45.0), (170.0, 170.0)):
         assert Limits.of(GO2, replace(contract, ends=contract.ends._replace(max_tilt=falls))).tilt == tilt
     assert narrow.to_dict()["safety"] == {"speed": 25, "tilt": False} and "safety" not in contract.to_dict()

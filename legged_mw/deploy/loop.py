@@ -100,6 +100,7 @@ class Loop:
         self.period, self.live = period, live
         self.now = 0.0  # [s] from the first step to this step, a multiple of the period
         self.behind = 0.0  # [s] delay of this step's begin
+        self.skipped = 0  # periods left out before this step
         self.work = 0.0  # [s] duration of the previous step
         self.steps = self.late = self.lost = 0
         self._tick, self._start, self._began = -1, 0.0, 0.0
@@ -165,6 +166,7 @@ class Loop:
         self._work.add(self.work)
         missed = max(0, int((ended - self._start - self._tick * self.period) / self.period))
         self._tick += missed
+        self.skipped = missed
         self.lost += missed
         self.now = self._tick * self.period
         due = self._start + self.now

@@ -184,7 +184,7 @@ class _Step:
         if fell and not self.states:
             self.summary.fell = loop.now
         if self.states is None or self.states.armed:
-            trip = self.safety.sensed(measured, health, loop.now, loop.behind)
+            trip = self.safety.sensed(measured, health, loop.now, loop.behind, loop.skipped)
         if fell and self.states and self.states.state == POLICY:
             trip = trip or Trip("fall", "the robot fell")
         return measured, health, trip

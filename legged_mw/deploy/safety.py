@@ -78,7 +78,7 @@ class Limits:
     voltage: float = -OFF  # [V] lowest voltage of the battery; a robot's class sets it
     age: float = 2.0  # [periods] age of the newest measurement
     frozen: float = 4.0  # bitwise identical consecutive measurements
-    late: float = 5.0  # steps in one second that began more than half a period late
+    late: float = 5.0  # steps in one second that began more than half a period late, or not at all
     remote: float = 3.0  # [s] since the remote was last received, if it ever was [unitree_rl_lab]
 
     @staticmethod
@@ -122,7 +122,7 @@ def parse_limits(texts: Sequence[str]) -> dict[str, str]:
 def _value(name: str, value: Any, where: str) -> float:
     if name not in NAMES:
         raise LimitError(f"{where}: {unknown('limit', name, NAMES, 'the safety layer')}")
-    if value in ("off", False):  # YAML reads `off` as False
+    if value is False or value == "off":  # YAML reads `off` as False; a limit of 0 is not off
         return -OFF if name == "voltage" else OFF
     try:
         number = float(value)
@@ -176,15 +176,20 @@ class Safety:
         self._changed = set[
             str
         ]()  # sensors except joint_pos that changed at least once; a missing sensor never changes
-        self._late: deque[float] = deque()  # [s] times of late steps within the last second
+        self._late: deque[float] = deque()  # [s] times of late and left out steps in the last second
         self._remote: float | None = None  # [s] time at which the remote was last received
 
-    def sensed(self, measured: Measurement, health: Health, now: float, behind: float = 0.0) -> Trip | None:
-        """The first limit that a measurement exceeds. ``now`` [s]; ``behind`` [s]: delay of the step's begin."""
+    def sensed(
+        self, measured: Measurement, health: Health, now: float, behind: float = 0.0, skipped: int = 0
+    ) -> Trip | None:
+        """The first limit that a measurement exceeds.
+
+        ``now`` [s]; ``behind`` [s]: delay of the step's begin; ``skipped``: periods that were left out before it.
+        """
         return (
             self._finite(measured)
             or self._fresh(measured, health)
-            or self._on_time(now, behind)
+            or self._on_time(now, behind, skipped)
             or self._joints(measured)
             or self._tilt(measured)
             or self._machine(health)
@@ -298,13 +303,13 @@ class Safety:
             )
         return None
 
-    def _on_time(self, now: float, behind: float) -> Trip | None:
-        if behind > LATE * self.contract.period:
-            self._late.append(now)
+    def _on_time(self, now: float, behind: float, skipped: int) -> Trip | None:
+        self._late.extend([now] * (skipped + (behind > LATE * self.contract.period)))
         while self._late and now - self._late[0] >= 1.0:
             self._late.popleft()
         if (count := len(self._late)) >= self.limits.late:
             what = f"the last by {1e3 * behind:.0f} ms" if behind else "by more than half a period"
+            what = f"or not at all: {skipped} before this one" if skipped else what
             return Trip("late", f"{count} steps within a second began late, {what}")
         return None
 
