@@ -196,6 +196,9 @@ def test_a_gamepad(contract: Contract, tmp_path: Path) -> None:
     assert feel((1, 1, 0)).pressed == {"A"} and feel((1, 1, 6)).pressed == {"select"}
     np.testing.assert_allclose(feel((-32767, 2, 1), (32767, 2, 3)).command, [1.5, 0.0, -1.2])
     assert feel((32767, 2, 2), (1, 1, 1)).stop == "the gamepad's emergency stop (L2 + B)"
+    assert feel((0, 1, 1), (-32767, 2, 2)).stop == ""
+    tapped = feel((32767, 2, 2), (1, 1, 1), (0, 1, 1), (-32767, 2, 2))  # and let go between two steps
+    assert tapped.stop == "the gamepad's emergency stop (L2 + B)" and feel().stop == ""
     os.close(keep)
     assert pad.poll(Health()).stop == "the gamepad was unplugged"
     pad.close()

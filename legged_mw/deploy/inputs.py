@@ -110,14 +110,15 @@ class Gamepad(RobotRemote):
         self._buttons, self._lost = set[str](), False
 
     def poll(self, health: Health) -> DriveInput:
-        pressed = frozenset[str]()
+        pressed, stop = frozenset[str](), ""
         while not self._lost and (event := self._event()):
             self._take(*event)
-            pressed |= self._wish(self._remote()).pressed  # a press can begin and end between two steps
+            wish = self._wish(self._remote())  # a press can begin and end between two steps
+            pressed, stop = pressed | wish.pressed, stop or wish.stop
         if self._lost:
             return DriveInput(stop=f"{self.name} was unplugged")
         inputs = self._wish(self._remote())
-        return inputs._replace(pressed=inputs.pressed | pressed)
+        return inputs._replace(pressed=inputs.pressed | pressed, stop=stop or inputs.stop)
 
     def close(self) -> None:
         if self._file >= 0:
