@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -63,6 +65,29 @@ def test_a_mark_falls_beyond_its_tolerance_alone() -> None:
     assert not gate.fallen({"marks": gate.marks_of(more)}, {"marks": gate.marks_of(fewer)})
     assert gate.fallen({"marks": gate.marks_of(fewer)}, {"marks": gate.marks_of(more)})
     assert gate.marks_of(more)[0]["worst"] == 0.9
+
+
+def test_a_clean_repeat_hides_no_falls() -> None:
+    """The range of the new repeats is wide, so their mean alone would pass."""
+    stored, now = (
+        {"marks": gate.marks_of([[Figure("falls", each, 0, 0.0)] for each in values])}
+        for values in ((0, 0, 0), (0, 22, 22))
+    )
+    assert gate.fallen(now, stored) == ["falls: fails in 2 of 3 repeats, passed in all before"]
+    once = {"marks": gate.marks_of([[Figure("falls", each, 0, 0.0)] for each in (0, 0, 1)])}
+    assert gate.fallen(once, stored) == []
+
+
+def test_a_run_that_went_on_is_graded_by_its_newest_checkpoint(tmp_path: Path) -> None:
+    """Not by an older export: resumed and stopped, it has made no new one."""
+    run = tmp_path / "run"
+    shutil.copytree(GO2, run / "export")
+    (run / "model_500.pt").touch()
+    os.utime(run / "model_500.pt", (0.0, 0.0))
+    assert gate.find_export(str(run)) == run / "export"
+    (run / "model_900.pt").touch()
+    os.utime(run / "model_900.pt", (2e9, 2e9))
+    assert gate.find_export(str(run)) is None
 
 
 def test_marks_of_three_axes_have_three_names() -> None:

@@ -96,11 +96,15 @@ def main(export: Export) -> None:
 
 
 def find_export(name: str, checkpoint: int = -1) -> Path | None:
-    """The export folder of ``name``: an export, a run or a shipped policy. None: the run has no export yet."""
+    """The export folder of ``name``: an export, a run or a shipped policy. None: the run has none of its newest policy.
+
+    A run that was resumed and stopped has checkpoints that are newer than its export.
+    """
     folder = typed(name)
     if checkpoint == -1:
+        trained = max((file.stat().st_mtime for file in folder.glob("model_*.pt")), default=0.0)
         for path in (folder, folder / "export"):
-            if (path / CONTRACT_FILE).is_file():
+            if (path / CONTRACT_FILE).is_file() and (path / CONTRACT_FILE).stat().st_mtime >= trained:
                 return find(str(path))
     return None if folder.exists() or Path("logs", name).exists() or checkpoint != -1 else _shipped(name)
 
@@ -304,7 +308,10 @@ def read_result(file: Path) -> dict[str, Any]:
 
 
 def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
-    """One line for each mark that is worse than in ``before`` by more than its tolerance."""
+    """One line for each mark that is worse than in ``before`` by more than its tolerance.
+
+    Also for one that passed in all repeats and now fails in most: a mean over repeats that differ much hides it.
+    """
     now, lines = {each["name"]: each for each in result["marks"]}, []
     for was in before["marks"]:
         new, digits = now.get(was["name"], {"mean": None}), was["digits"]
@@ -318,7 +325,15 @@ def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
         if worse > tolerance:
             details = f"tolerance {tolerance:.{max(digits, 3)}f}, mark {was['mark']:g}"
             lines.append(f"{was['name']}: {new['mean']:.{digits}f}, was {was['mean']:.{digits}f} ({details})")
+        elif was.get("passes") and 2 * (failed := _failures(new)) > len(new["values"]):
+            lines.append(f"{was['name']}: fails in {failed} of {len(new['values'])} repeats, passed in all before")
     return lines
+
+
+def _failures(mark: Mapping[str, Any]) -> int:
+    """The number of repeats that fail a mark."""
+    figure = Figure(mark["name"], None, mark["digits"], mark["mark"], more_is_better=mark["more_is_better"])
+    return sum(value is not None and not figure._replace(value=value).passes() for value in mark["values"])
 
 
 def table(result: Mapping[str, Any], before: Mapping[str, Any] | None) -> str:
