@@ -21,10 +21,12 @@ from legged_mw.envs.robot_task import motor_ratings
 from legged_mw.eval import heat, report
 from legged_mw.eval.heat import Motion, Switch
 from legged_mw.eval.report import Column
+from legged_mw.export.exporter import export
 from legged_mw.utils import motor_heat
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.motor_heat import Ratings
 from legged_mw.utils.task import load_task
+from tests.test_export import untrained
 
 POLICIES = ROOT / "resources/policies"
 GO2 = POLICIES / "go2_flat"
@@ -200,6 +202,17 @@ def test_contracts_without_ratings_are_read(tmp_path: Path, short_runs: None) ->
     assert contract.ratings is None and "ratings" not in contract.to_dict()
     result = heat_exam.run_heat(folder, contract_rules(contract))
     assert result["ratings"] == {} and result["trips"] is None and result["phases"]["walking"]["rms"][0] > 0.0
+
+
+def test_an_export_of_torques(tmp_path: Path, short_runs: None) -> None:
+    """It begins without torque; each robot has a delay of its own, and is recorded at each physics step."""
+    task, checkpoint = untrained(ROOT / "configs/go1_flat.py", tmp_path, {"control.actuator": "torque"})
+    export(task, checkpoint, folder := tmp_path / "out")
+    stage = DeployStage(folder, 3, each=lambda: None)
+    stage.fleet.set_delay(np.array([0.0, 0.01, 0.02]))
+    stage.step(None)
+    assert not stage.fleet._sent[-1].any()
+    assert heat_exam.run_heat(folder, contract_rules(read_contract(folder)))["phases"]["walking"]
 
 
 def test_the_config_gives_the_contract_its_ratings() -> None:

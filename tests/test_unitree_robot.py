@@ -16,6 +16,7 @@ from legged_mw.deploy.robot import RobotError, damped
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.unitree.client import UnitreeRobot, check_rows
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
+from legged_mw.unitree.driver import senses_feet
 from legged_mw.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
 from legged_mw.unitree.robots import G1, GO2, H1
 from legged_mw.unitree.serve import STEP, Faults, SimulatedUnitree
@@ -407,7 +408,25 @@ def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
 
 def test_a_go2_measures_what_its_feet_touch() -> None:
     contract = read_contract(POLICIES / "go2_flat")
-    check_rows(replace(contract, rows=(*contract.rows, ContractRow("touch", 4, "", "", 0.0, "foot_contact"))), GO2)
+    touch = replace(contract, rows=(*contract.rows, ContractRow("touch", 4, "", "", 0.0, "foot_contact")))
+    check_rows(touch, GO2)
+    nameless = replace(touch, feet=dict(zip("abcd", contract.feet.values(), strict=True)))
+    with pytest.raises(RobotError, match="the policy observes touch, which a go2 does not measure"):
+        check_rows(nameless, GO2)
+    assert senses_feet(contract) and not senses_feet(nameless)
+
+
+def test_a_foot_is_that_of_the_leg_that_begins_its_name() -> None:
+    """As a draft names feet: FL_foot. In the contract's order, not the wire's."""
+    state = WireMessage(LAYOUTS["unitree_go", "LowState_"])
+    state["imu_state.quaternion"], state["foot_force"], state["motor_state.mode"] = [1, 0, 0, 0], [60, 0, 0, 0], 1
+    state["tick"], state["power_v"] = 5, 30
+    state.seal()
+    contract = read_contract(POLICIES / "go2_flat")
+    for names in (("FL", "FR", "RL", "RR"), ("FL_foot", "FR_foot", "RL_foot", "RR_foot"), ("fl", "fr", "rl", "rr")):
+        own = replace(contract, feet=dict(zip(names, contract.feet.values(), strict=True)))
+        robot = UnitreeRobot(own, Owner(), Received(state.body, 0.0), clock=lambda: 0.0)
+        assert robot.read().foot_contact.tolist() == [0, 1, 0, 0]
 
 
 def test_the_exam_over_a_slow_wire_begins(domain: int) -> None:

@@ -149,6 +149,11 @@ class Action(NamedTuple):
     lowest: np.ndarray  # (D,) lowest target of the servo, as in training; -MOST: no limit
     highest: np.ndarray  # (D,) highest target; MOST: no limit
 
+    @property
+    def of_angles(self) -> bool:
+        """Whether the targets are angles, not torques or speeds."""
+        return self.origin not in ("torque", "speed")
+
     def held(self, targets: np.ndarray) -> np.ndarray:
         """Clip ``targets`` (..., D) to the range; NaN stays."""
         return np.clip(targets, self.lowest, self.highest)

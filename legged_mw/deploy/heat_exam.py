@@ -50,7 +50,7 @@ def run_heat(
         each=lambda: log[0].sample(),
     )
     log.append(MotorLog(stage.fleet))
-    holds = walks and contract.action.origin not in ("torque", "speed")
+    holds = walks and contract.action.of_angles
     if isinstance(exam, ExamRules):
         motions, switch = walk(stage, log[0], half_speed(exam), holds)
     else:

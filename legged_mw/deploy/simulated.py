@@ -138,9 +138,7 @@ class Fleet:
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
         # (N, D) [rad] or [N m] targets before the first action; `_sent`: targets of the last periods, newest first
-        self._start = np.tile(
-            0.0 if contract.action.origin in ("torque", "speed") else contract.default_pose, (count, 1)
-        )
+        self._start = np.tile(contract.default_pose * contract.action.of_angles, (count, 1))
         self._sent = self._start[None].copy()
         self._late = np.zeros(count, dtype=int)  # (N,) delay from `write` to the motors, in physics steps
         # index of each joint in qpos

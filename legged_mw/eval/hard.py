@@ -130,6 +130,7 @@ class Walk(NamedTuple):
     limit: Array  # (D,) [N m] torque limits; infinite if unknown
     joints: Sequence[str]
     clock: float | None  # [1/s] stride frequency of the policy's gait clock
+    servos: bool = True  # the targets are angles, as above; else torques or speeds, which have no range here
 
 
 def looks(walk: Walk) -> dict[str, Any]:
@@ -156,11 +157,11 @@ def looks(walk: Walk) -> dict[str, Any]:
         "all_down": _number(down.all(axis=1).mean()),
         "none_down": _number(1.0 - down.any(axis=1).mean()),
         "angle_at_limit": angle,
-        "target_at_limit": target,
+        "target_at_limit": target if walk.servos else {"worst": 0.0, "joint": ""},
         "hit": {"mean": _number(np.mean(hit)), "most": _number(max(hit))} if hit else None,
         "torque_over_limit": _worst(rms / walk.limit, walk.joints) if np.isfinite(walk.limit).any() else None,
         "torque_by_joint": dict(zip(walk.joints, [_number(each) for each in rms / walk.limit], strict=True)),
-        "target_step": _number(np.abs(np.diff(walk.target, axis=0)).mean()),
+        "target_step": _number(np.abs(np.diff(walk.target, axis=0)).mean()) if walk.servos else None,
         "fast_share": fast_share(walk.target, walk.period),
         "peak_power": _number(np.abs(walk.torque * walk.speed).sum(axis=1).max()),
     }
@@ -372,7 +373,7 @@ def figures(result: Mapping[str, Any]) -> list[Figure]:
             best.get("torque_over_limit"),
             without="none",
         ),
-        Figure("target's mean step [rad]", walk["target_step"], 3, None, best.get("target_step")),
+        Figure("target's mean step [rad]", walk["target_step"], 3, None, best.get("target_step"), without="none"),
         Figure("target's power above 10 Hz", walk["fast_share"], 3, None, best.get("fast_share"), without="none"),
         Figure("peak power [W]", walk["peak_power"], 0),
     ]

@@ -99,7 +99,7 @@ class UnitreeRobot(Robot):
         self.machine = machine_of(contract.joints)
         self.limits, self.motors = self.machine.limits, self.machine.motors
         check_rows(contract, self.machine, odometry)
-        self._slots = order(self.machine, contract.joints)
+        self._slots, self._feet = order(self.machine, contract.joints), self.machine.feet_of(contract.feet)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
         self.report = ""  # set by `close`: latencies of the wire
         self._sealed = not simulated or self._state["crc"] != 0
@@ -144,9 +144,8 @@ class UnitreeRobot(Robot):
         state, slots = self._state, self._slots
         w, x, y, z = (float(value) for value in state["imu_state.quaternion"])
         feet = np.zeros(len(self.contract.feet))
-        if self.machine.feet:
-            force = dict(zip(self.machine.feet, state["foot_force"], strict=True))
-            feet = np.array([float(force.get(name, 0) > TOUCH) for name in self.contract.feet])
+        if self._feet:
+            feet = (np.asarray(state["foot_force"])[self._feet] > TOUCH).astype(float)
         q, dq, torque = (state[f"motor_state.{part}"][slots].astype(float) for part in ("q", "dq", "tau_est"))
         return Measurement(
             lin_vel=np.zeros(3),
@@ -247,13 +246,16 @@ class UnitreeRobot(Robot):
 
 def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> None:
     """Raise RobotError for a policy with rows that this robot does not measure, or without angle commands."""
-    if contract.action.origin in ("torque", "speed"):
+    if not contract.action.of_angles:
         raise RobotError(
             f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here"
         )
-    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else []), *([ROW] if odometry else [])} - {
-        PLACE
-    }
+    measured = {
+        *_MEASURED,
+        *COMPUTED,
+        *(["foot_contact"] if machine.feet_of(contract.feet) else []),
+        *([ROW] if odometry else []),
+    } - {PLACE}
     if wrong := [row for row in contract.rows if row.measured not in measured]:
         estimated = "add --velocity odometry, or " if [row.measured for row in wrong] == [ROW] else ""
         raise RobotError(

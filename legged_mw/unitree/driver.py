@@ -19,7 +19,7 @@ from legged_mw.unitree.robots import machine_of
 
 def senses_feet(contract: Contract) -> bool:
     """True if the contract's robot measures foot contacts."""
-    return bool(machine_of(contract.joints).feet)
+    return bool(machine_of(contract.joints).feet_of(contract.feet))
 
 
 def connect(folder: Path, contract: Contract, args: argparse.Namespace, odometry: bool) -> Robot:

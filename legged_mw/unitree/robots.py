@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +48,11 @@ class Machine:
     @property
     def slots(self) -> int:
         return {"unitree_go": 20, "unitree_hg": 35}[self.package]
+
+    def feet_of(self, names: Iterable[str]) -> list[int]:
+        """Index in foot_force of each foot, by the leg that begins its name (FR, FR_foot). Empty if one has none."""
+        legs = [[i for i, leg in enumerate(self.feet) if name.upper().startswith(leg)] for name in names]
+        return [leg[0] for leg in legs] if all(legs) and len({leg[0] for leg in legs}) == len(legs) else []
 
 
 GO2 = Machine(

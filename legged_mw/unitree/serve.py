@@ -335,9 +335,10 @@ class SimulatedUnitree:
         if self.machine.package == "unitree_go":
             state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], voltage
             state["motor_state.lost"] = state["motor_state.lost"] + dead  # messages to dead motors are lost
-            feet = zip(self.contract.feet, self._scene.contacts, strict=True)
-            touch = {foot: (self.data.sensordata[where] > 0.0).any() for foot, where in feet}
-            state["foot_force"] = [_TOUCH * touch.get(foot, False) for foot in self.machine.feet] or 0
+            force = np.zeros(4, dtype=int)
+            for foot, where in zip(self.machine.feet_of(self.contract.feet), self._scene.contacts, strict=False):
+                force[foot] = _TOUCH * (self.data.sensordata[where] > 0.0).any()
+            state["foot_force"] = force
         else:
             body = _MACHINE.get(self.machine.name, 0) if faults.mode_machine is None else faults.mode_machine
             state["mode_machine"] = body
