@@ -120,6 +120,8 @@ def lines_on(task: LoadedTask) -> list[str]:
         ("def _init_buffers(self):\n    self.mine = torch.zeros(3)", "super()._init_buffers()"),
         ("def _update_state(self):\n    self.mine = 1", "super()._update_state()"),
         ("def _end_step(self):\n    pass", "super()._end_step()"),
+        ("def on_training_progress(self, share):\n    self.mine = share", "super().on_training_progress(share)"),
+        ("def training_state(self):\n    return {}", "super().training_state()"),
         ("def reset_envs(self, mask):\n    self.mine = mask", "super().reset_envs(mask)"),
         ("def _reset_robots(self, mask):\n    self.mine = mask", "super()._reset_robots(mask)"),
         ("def _reset_task(self, mask):\n    self.mine = mask", "super()._reset_task(mask)"),

@@ -275,11 +275,17 @@ def test_configured_kicks_are_the_tasks() -> None:
     )
 
 
-def test_what_is_shorter_than_a_step_lasts_one() -> None:
-    short = {"perturbation.interval": [0.001, 0.002], "perturbation.duration": [0.001, 0.005]}
-    kicks = make_env(2, {**KICKS, **QUIET, **short}).perturbation
+def test_a_pause_lasts_a_step_and_a_kick_two_at_least() -> None:
+    """Of one sample, a half sine would have no force."""
+    short = {"perturbation.interval": [0.001, 0.002], "perturbation.duration": [0.001, 0.02]}
+    kicks = make_env(2, {**KICKS, **QUIET, **short, "perturbation.velocity": [3.0, 3.0]}).perturbation
     kicks._redraw(torch.ones(2, dtype=torch.bool))
-    assert kicks._kick[:, :2].tolist() == [[1.0, 1.0]] * 2
+    assert kicks._kick[:, :2].tolist() == [[1.0, 2.0]] * 2
+    force = torch.zeros(2, 3)
+    for _ in range(3):
+        kicks._kick_robots()
+        force += kicks.kick_force
+    assert (force.norm(dim=1) * DT / MASS).tolist() == pytest.approx([0.75] * 2, rel=1e-3)  # dv / pi is 0.95
 
 
 def test_reset_ends_a_kick_and_the_next_one_is_whole() -> None:

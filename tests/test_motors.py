@@ -549,9 +549,9 @@ class OnWheels(LeggedRobot):
         """Legs turn to an angle, wheels turn at a speed: 20 rad/s by an action of 1."""
         return super()._compute_torques(actions) + self.wheels * self.d_gains * 20.0 * actions
 
-    def _update_state(self) -> None:
+    def _refresh_base(self) -> None:
         """The angle of a wheel grows without end: neither policy nor rewards read it."""
-        super()._update_state()
+        super()._refresh_base()
         self.dof_offset.masked_fill_(self.wheels, 0.0)
         self.joint_reading.masked_fill_(self.wheels, 0.0)
 
@@ -592,3 +592,10 @@ def test_a_robot_rolls_on_wheels_that_a_law_in_code_drives(engine: str, tmp_path
         assert bool((env.base_ang_vel[:, 2] > 0.1).all()) == turns
     assert not env.fell.any()
     assert not env.joint_reading[:, of_wheels].any()
+    env.episode_length_buf = torch.tensor([0, env.max_episode_length - 1])  # the next step ends world 1
+    seen = env.step(torch.zeros(2, env.num_actions))[0]["state"]
+    assert env.reset_buf.tolist() == [False, True]
+    assert (
+        not env.joint_reading[:, of_wheels].any()
+        and not seen[:, env.observations.span("state", "dof_pos")][:, of_wheels].any()
+    )

@@ -208,6 +208,7 @@ W, L = 0.2131431, 0.5557057
         ({"clip_termination": True, "scales.termination": -0.5}, W, L - 0.5),
         ({"max_reward": 0.002}, 0.1, 0.1 - 1.0),  # 0.002 a step of 0.02 s is 0.1 a second; the fall comes after it
         ({"max_reward": 0.002, "clip_termination": True}, 0.1, 0.0),
+        ({"max_reward": 0.002, "only_positive_rewards": False}, 0.1, 0.1 - 1.0),
         ({"scales.torques": -0.02}, 0.0, L - 0.1546410 - 1.0),  # W - 0.32 is clipped
         ({"scales.torques": -0.02, "only_positive_rewards": False}, W - 0.32, L - 0.1546410 - 1.0),
         (

@@ -182,6 +182,18 @@ def test_a_trunk_near_the_ground_is_a_fall() -> None:
     assert not free.fell.any()
 
 
+def test_a_new_episode_keeps_no_height_of_the_last_one() -> None:
+    """A row of one's own may read them: where the robot begins, and feet on the ground."""
+    env = rough(4)
+    env.step(STAND.expand(4, -1))
+    env.sim.qpos[0, 2] += 1.0
+    env.sim.qpos[0, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    env.step(STAND.expand(4, -1))
+    assert env.reset_buf.tolist() == [True, False, False, False]
+    assert env._height_at and not env.foot_height[0].any() and env.foot_height[1].any()
+    torch.testing.assert_close(env.base_height[0], (env.root_pos[:, 2] - env._height_at(env.root_pos[:, :2]))[0])
+
+
 # ---- levels ---------------------------------------------------------------------------------------------------------
 
 

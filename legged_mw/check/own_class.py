@@ -12,9 +12,10 @@ from typing import Any
 
 from legged_mw.utils.errors import StepError, place_of
 
-HOOKS = (  # the parents' methods are needed in every step or reset; hooks of commands may be replaced
-    *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
+HOOKS = (  # the parents' methods are needed in every step, reset or iteration; hooks of commands may be replaced
+    *("_init_buffers", "_episode_columns", "_update_state", "_refresh_base", "_end_step", "compute_observations"),
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
+    *("on_training_progress", "training_state", "load_training_state"),
 )
 WITHOUT = "# without super"  # a comment in a method that intentionally does not call its parent's
 # Terms of RobotTask and LeggedRobot with a positive usual scale; their other terms are costs

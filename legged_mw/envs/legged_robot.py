@@ -90,7 +90,9 @@ class LeggedRobot(RobotTask):
         """Draw new commands, and clear the feet's contacts and heights."""
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
-        if self.cfg.observations.foot_height:
+        if self.tiles:
+            self.base_height.masked_fill_(mask, self.init_pos[2])
+        if self.tiles or self.cfg.observations.foot_height:
             self.foot_height.masked_fill_(mask[:, None], 0.0)  # remove the last episode's values
         if self.feet.forces is not None:
             self.feet.forces.masked_fill_(mask[:, None, None], 0.0)

@@ -24,7 +24,8 @@ class Perturbation:
         """``mass``: of the robot [kg]; ``dt``: control step [s]."""
         self.cfg, self._sim, self._root, self._mass, self._dt = cfg, sim, root_body, mass, dt
         n, device = sim.num_envs, sim.device
-        spans = [cfg.interval, cfg.duration, [-math.pi, math.pi], cfg.velocity]
+        lasts = [max(each, 2.0 * dt) for each in cfg.duration]  # of one sample, a half sine has no force
+        spans = [cfg.interval, lasts, [-math.pi, math.pi], cfg.velocity]
         self._ranges = torch.tensor(spans, dtype=torch.float, device=device).T.contiguous()  # (2, 4)
         self._kick = torch.zeros(n, 4, device=device)  # pause, duration [control steps], direction [rad], dv [m/s]
         self._clock = torch.zeros(n, device=device)  # time since the draw [control steps]

@@ -366,8 +366,7 @@ class RobotTask(BaseTask):
             terms.masked_fill_(self.broken[:, None], 0.0)
             self.nonfinite[0].clear(terms)
             total = terms[:, : self._num_clipped].sum(dim=1)
-            if rewards.only_positive_rewards:
-                total.clamp_(0.0, rewards.max_reward)
+            total.clamp_(0.0 if rewards.only_positive_rewards else None, rewards.max_reward)
             if self._num_clipped < len(self.reward_names):
                 total += terms[:, self._num_clipped]
             self.episode_sums.add_(terms)

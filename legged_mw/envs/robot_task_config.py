@@ -183,7 +183,7 @@ class RobotTaskCfg(Config):
 
         kick: bool = False  # [P]
         interval: PositiveRange = [1.0, 3.0]  # pause between kicks [s] [P]
-        duration: PositiveRange = [0.05, 0.2]  # [s] [P]
+        duration: PositiveRange = [0.05, 0.2]  # [s], at least two control steps [P]
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # dv of a world increases from 0 with the survived share of its episodes [ours]
         curriculum_rate: PositiveShare = 0.5  # change of that level per episode, as a share of the difference [ours]
