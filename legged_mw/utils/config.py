@@ -67,7 +67,7 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
     path, inherited, value = f"{_path(cls)}.{name}", known.get(name), getattr(cls, name, None)
     parent, annotated = cls.__bases__[0], name in inspect.get_annotations(cls)
     if _is_section(value) and not annotated:
-        return _check_section(cls, name, value, inherited)
+        return _check_section(cls, name, value, known)
     if name not in vars(cls) and not annotated:
         return inherited
     if inherited is None and not annotated and (inspect.isroutine(value) or isinstance(value, property)):
@@ -89,9 +89,16 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
     return kind
 
 
-def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
-    """The section `name` of `cls`. Raises ConfigError unless it extends those of all parents of `cls`."""
-    path = f"{_path(cls)}.{name}"
+def _check_section(cls: type, name: str, section: type, known: dict[str, Any]) -> type:
+    """The section `name` of `cls`. Raises ConfigError unless it extends those of all parents of `cls`.
+
+    Also for a new one that extends a section of another name, which is a name written wrong.
+    """
+    path, inherited = f"{_path(cls)}.{name}", known.get(name)
+    for other, kind in known.items() if inherited is None else ():
+        if _is_section(kind) and issubclass(section, kind):
+            write = f"write `class {other}({_parents(cls, other)}):`"
+            raise ConfigError(f"{path} overrides nothing: it extends section '{other}'; {write}")
     if inherited is not None and not _is_section(inherited):
         raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
     inherited_sections = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]

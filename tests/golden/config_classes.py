@@ -21,6 +21,10 @@ CLASSES = {
         "class A(Base):\n    class rewards(Base.rewards):\n        class scales:\n            torques: float = 1.0"
     ),
     "a section of another parent": "class A(Base):\n    class env(Base.control):\n        pass",
+    "a misspelt section": "class A(Base):\n    class controll(Base.control):\n        pass",
+    "a misspelt inner section": (
+        "class A(Base):\n    class rewards(Base.rewards):\n        class scale(Base.rewards.scales):\n            pass"
+    ),
     "a section that skips a generation": "class A(Go1):\n    class env(Base.env):\n        pass",
     "a section of one parent of two": (
         "class W(Base):\n    class env(Base.env):\n        pass\nclass A(Go1, W):\n    class env(Go1.env):\n        pass"
