@@ -436,7 +436,7 @@ CASES: dict[str, Case] = {
         known_after=0.5,
     ),
     "slow policy": Case(
-        "5 steps within a second began late", policy=takes(0.035), known=lambda rig: rig.read_at, known_after=0.5
+        "[56] steps within a second began late", policy=takes(0.035), known=lambda rig: rig.read_at, known_after=0.5
     ),
     "remote lost": Case(
         "the remote was not heard for 3.0 s",
