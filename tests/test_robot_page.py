@@ -432,6 +432,9 @@ def test_a_robot_that_would_sink_gets_firmer_servos(tmp_path: Path) -> None:
     assert (firm.guessed[2], soft.guessed[2]) == (firmer.format("1.5"), firmer.format("1.25"))
     assert firm.gains[0].kp > 1.2 * soft.gains[0].kp
     assert health_of(firm, heavy).stand.end == "stands"
+    heavy.write_text(text.replace('mass="7"', 'mass="40"'))
+    none = draft(heavy)
+    assert none.guessed[2] == "gains: as suggested below, though with up to 2 times them it does not stand either"
 
 
 FEET = {

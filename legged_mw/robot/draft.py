@@ -178,7 +178,8 @@ def _servos(
         if _stands(robot, pose, place, joints, feet, chosen(firmness)):
             text = f"{firmness:g} times what is suggested below, to stand on its servos"
             return chosen(firmness), ("as suggested below" if firmness == 1.0 else text) + note
-    return chosen(1.0), "as suggested below" + note
+    tried = f", though with up to {FIRMNESS[-1]:g} times them it does not stand either" if len(feet) > 2 else ""
+    return chosen(1.0), f"as suggested below{tried}{note}"
 
 
 def _stands(

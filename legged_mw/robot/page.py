@@ -186,7 +186,10 @@ def doubtful(health: RobotNumbers, gains: Sequence[Gains]) -> list[str]:
     if health.rest.toppled or health.margin < 0.0:
         lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles")
     if health.stand.end != "stands":
-        lines.append(f"with action zero it {standing(health.stand)}: a biped may, others should stand")
+        lines.append(
+            f"with action zero it {standing(health.stand)}: a biped may, others should stand: raise control.stiffness, "
+            "or choose another init_state.default_joint_angles"
+        )
     return lines
 
 
