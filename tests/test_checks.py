@@ -122,6 +122,8 @@ def lines_on(task: LoadedTask) -> list[str]:
         ("def _end_step(self):\n    pass", "super()._end_step()"),
         ("def on_training_progress(self, share):\n    self.mine = share", "super().on_training_progress(share)"),
         ("def training_state(self):\n    return {}", "super().training_state()"),
+        ("def load_training_state(self, state):\n    self.mine = state", "super().load_training_state(state)"),
+        ("def _refresh_base(self):\n    self.mine = 1", "super()._refresh_base()"),
         ("def reset_envs(self, mask):\n    self.mine = mask", "super().reset_envs(mask)"),
         ("def _reset_robots(self, mask):\n    self.mine = mask", "super()._reset_robots(mask)"),
         ("def _reset_task(self, mask):\n    self.mine = mask", "super()._reset_task(mask)"),

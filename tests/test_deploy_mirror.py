@@ -169,14 +169,22 @@ def test_any_page_of_a_real_robot_may_damp_it(ends: Ends) -> None:
     assert ends.mirror.poll(Health()).stop == "the viewer's button"
 
 
-def test_what_is_shown_is_called_old_if_the_program_is_silent(
+def test_what_is_shown_is_called_old_if_nothing_is_measured(
     ends: Ends, contract: Contract, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends.mirror.show(0.0, measurement(contract), state("policy", ""))
     assert "old" not in ends.turn()
     later = time.monotonic() + 3.0
     monkeypatch.setattr(time, "monotonic", lambda: later)
-    assert ends.turn()["old"].startswith("the robot's program has sent nothing for 3.")
+    assert ends.turn()["old"].startswith("nothing was measured for 3.")
+    ends.mirror.show(1.0, None, state("damping", "the robot is silent"))  # its program goes on, the robot does not
+    lines = ends.turn()
+    assert lines["state"] == "damping" and lines["old"].startswith("nothing was measured for 3.")
+    ends.mirror.show(2.0, measurement(contract), state("policy", ""))
+    assert "old" not in ends.turn()
+    ends.mirror.poll(Health(age_s=0.7))
+    ends.mirror.show(3.0, measurement(contract), state("policy", ""))
+    assert ends.turn()["old"] == "nothing was measured for 0.7 s"
 
 
 def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:

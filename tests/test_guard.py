@@ -67,6 +67,8 @@ HOST_READS: dict[str, Callable[[], object]] = {
     "lstsq": lambda: torch.linalg.lstsq(X[:, :2], X),
     "inv": lambda: torch.linalg.inv(X[:, :2] + 1.0),
     "normal": lambda: torch.normal(X, X + 1.0),
+    "masked_fill by a tensor": lambda: X.masked_fill(MASK, X.amax()),
+    "masked_fill_ by a tensor": lambda: X.clone().masked_fill_(MASK, X.amax()),
 }
 HOST_WRITES: dict[str, Callable[[], object]] = {
     "tensor": lambda: torch.tensor([1.0]),

@@ -429,6 +429,17 @@ def test_a_foot_is_that_of_the_leg_that_begins_its_name() -> None:
         assert robot.read().foot_contact.tolist() == [0, 1, 0, 0]
 
 
+def test_a_served_go2_feels_its_feet_whatever_their_names(domain: int) -> None:
+    """In the order of the wire: FR, FL, RR, RL."""
+    both = pair("go2_flat", domain, hoist=False)
+    for names in (("FL", "FR", "RL", "RR"), ("FL_foot", "FR_foot", "RL_foot", "RR_foot")):
+        both.sim.contract = replace(both.contract, feet=dict(zip(names, both.contract.feet.values(), strict=True)))
+        both.sim.data.sensordata[:] = 0.0
+        both.sim.data.sensordata[both.sim._scene.contacts[0]] = 1.0  # of the first of the names
+        both.sim._fill_own()
+        assert np.flatnonzero(both.sim._state["foot_force"]).tolist() == [1]
+
+
 def test_the_exam_over_a_slow_wire_begins(domain: int) -> None:
     """A reset moves the clock by a second, and the first state since must have arrived."""
     both = pair("go2_flat", domain, faults=Faults(delay_ms=10.0, jitter_ms=2.0), hoist=False)

@@ -212,6 +212,8 @@ def _breach_of_kernel(func: Any, args: tuple) -> str:
         return f"multinomial reads a tensor to the host; {write}"
     if name in _DATA_SHAPED or (name, overload) == ("repeat_interleave", "Tensor"):
         return f"{name.strip('_')} has a shape that depends on data; keep every row, and write torch.where(mask, a, b)"
+    if name in ("masked_fill", "masked_fill_") and overload.startswith("Tensor"):
+        return f"{name.strip('_')} reads its value to the host; write assign(x, mask, value), or a Python number"
     if name == "normal" and overload in ("Tensor_Tensor", "float_Tensor"):
         return "normal reads the sign of a tensor of deviations to the host; write mean + std * torch.randn_like(std)"
     if name in _INDEXED and any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1]):

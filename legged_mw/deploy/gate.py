@@ -50,7 +50,13 @@ def parse() -> argparse.Namespace:
     seeds = f"number of repeats, each with its own start states and noise (default: {SEEDS})"
     parser.add_argument("--seeds", type=positive, default=SEEDS, metavar="N", help=seeds)
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="the first seed; 0: no random start states")
-    parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="a run's checkpoint (default: newest)")
+    parser.add_argument(
+        "--checkpoint",
+        type=int,
+        default=-1,
+        metavar="N",
+        help="a run's checkpoint (default: its export, made when it was trained; without one, the newest)",
+    )
     common = "walking exam: the trained command ranges, or the common range of the robot's published policies"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--scene", metavar="FILE", help="walking exam: an MJCF of the robot, such as the vendor's")
@@ -96,15 +102,11 @@ def main(export: Export) -> None:
 
 
 def find_export(name: str, checkpoint: int = -1) -> Path | None:
-    """The export folder of ``name``: an export, a run or a shipped policy. None: the run has none of its newest policy.
-
-    A run that was resumed and stopped has checkpoints that are newer than its export.
-    """
+    """The export folder of ``name``: an export, a run or a shipped policy. None: the run has no export yet."""
     folder = typed(name)
     if checkpoint == -1:
-        trained = max((file.stat().st_mtime for file in folder.glob("model_*.pt")), default=0.0)
         for path in (folder, folder / "export"):
-            if (path / CONTRACT_FILE).is_file() and (path / CONTRACT_FILE).stat().st_mtime >= trained:
+            if (path / CONTRACT_FILE).is_file():
                 return find(str(path))
     return None if folder.exists() or Path("logs", name).exists() or checkpoint != -1 else _shipped(name)
 
@@ -325,15 +327,18 @@ def fallen(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
         if worse > tolerance:
             details = f"tolerance {tolerance:.{max(digits, 3)}f}, mark {was['mark']:g}"
             lines.append(f"{was['name']}: {new['mean']:.{digits}f}, was {was['mean']:.{digits}f} ({details})")
-        elif was.get("passes") and 2 * (failed := _failures(new)) > len(new["values"]):
+        elif was.get("passes") and 2 * (failed := _failures(new, was)) > len(new["values"]):
             lines.append(f"{was['name']}: fails in {failed} of {len(new['values'])} repeats, passed in all before")
     return lines
 
 
-def _failures(mark: Mapping[str, Any]) -> int:
-    """The number of repeats that fail a mark."""
-    figure = Figure(mark["name"], None, mark["digits"], mark["mark"], more_is_better=mark["more_is_better"])
-    return sum(value is not None and not figure._replace(value=value).passes() for value in mark["values"])
+def _failures(new: Mapping[str, Any], was: Mapping[str, Any]) -> int:
+    """The number of repeats that fail a mark, each worse than its old mean by more than its old tolerance."""
+    figure = Figure(new["name"], None, new["digits"], new["mark"], more_is_better=new["more_is_better"])
+    sign = -1.0 if new["more_is_better"] else 1.0
+    known = [value for value in new["values"] if value is not None]
+    failed = [value for value in known if not figure._replace(value=value).passes()]
+    return sum(sign * (value - was["mean"]) > was["tolerance"] for value in failed)
 
 
 def table(result: Mapping[str, Any], before: Mapping[str, Any] | None) -> str:

@@ -37,7 +37,7 @@ START = 30.0  # [s] time limit for a viewer to open
 # the only actions and their labels; "": the label of BINDINGS
 ACTIONS = {"reset": "Damp", "camera": "", "help": ""}
 DAMP = b"damp"
-SILENT = 0.5  # [s] without a message: the page says that what it shows is old
+SILENT = 0.5  # [s] without a measurement: the page says that what it shows is old
 _PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # fields of a measurement
 FLAGS = ("viewer", "camera", "host", "port")
 LIVE = ("native", "web")  # live values of --viewer
@@ -96,7 +96,7 @@ class RobotMonitor:
             "note": states.note,
             "command": states.command.tolist() if states.state == POLICY else None,
         }
-        message |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage}
+        message |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage, "age": health.age_s}
         message["hottest"] = None if health.temperatures is None else float(health.temperatures.max())
         if measured is not None:
             message |= {name: getattr(measured, name).tolist() for name in _PARTS}
@@ -140,7 +140,7 @@ class MirroredStage:
             )
         ]
         self.latest: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
-        self._heard = time.monotonic()  # [s] time of the newest message
+        self._heard = time.monotonic()  # [s] time of the newest measurement
 
     def step(self, commands: Floats | None) -> None:
         """Read the newest message. Exit if the robot's program has ended."""
@@ -152,15 +152,17 @@ class MirroredStage:
             raise SystemExit
         if newest is None:
             return
-        self.latest, self._heard = self.latest | newest, time.monotonic()
+        self.latest |= newest
+        if "joint_pos" in newest:
+            self._heard = time.monotonic()
         if "joint_pos" in newest and np.isfinite([*newest["joint_pos"], *newest["gravity"]]).all():
             self._data.qpos[:2] = newest["place"][:2]
             angles, gravity = np.array(newest["joint_pos"]), np.array(newest["gravity"])
             place(self._model, self._data, self.contract.joints, angles, gravity, newest["place"][2])
 
     def silent(self) -> float:
-        """Time [s] since the newest message."""
-        return time.monotonic() - self._heard
+        """Age [s] of the measurement that is shown: of the robot's own message, and of its program's."""
+        return time.monotonic() - self._heard + (self.latest.get("age") or 0.0)
 
     def commands(self) -> Floats:
         return np.array([self.latest["command"] or [each.default for each in self.command_table]])
@@ -218,7 +220,7 @@ class MirrorSession(Session):
         ):
             lines += [(name, form.format(latest[key]))] if latest.get(key) is not None else []
         if (silent := self.stage.silent()) > SILENT:
-            lines.insert(0, ("old", f"the robot's program has sent nothing for {silent:.1f} s"))
+            lines.insert(0, ("old", f"nothing was measured for {silent:.1f} s"))
         return tuple(lines)
 
 

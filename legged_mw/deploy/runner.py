@@ -184,7 +184,8 @@ class _Step:
         if fell and not self.states:
             self.summary.fell = loop.now
         if self.states is None or self.states.armed:
-            trip = self.safety.sensed(measured, health, loop.now, loop.behind, loop.skipped)
+            skipped = loop.skipped if loop.steps > 2 else 0  # the first step may open a window
+            trip = self.safety.sensed(measured, health, loop.now, loop.behind, skipped)
         if fell and self.states and self.states.state == POLICY:
             trip = trip or Trip("fall", "the robot fell")
         return measured, health, trip

@@ -91,7 +91,7 @@ class LeggedRobot(RobotTask):
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
         if self.tiles:
-            self.base_height.masked_fill_(mask, self.init_pos[2])
+            assign(self.base_height, mask, self.init_pos[2])
         if self.tiles or self.cfg.observations.foot_height:
             self.foot_height.masked_fill_(mask[:, None], 0.0)  # remove the last episode's values
         if self.feet.forces is not None:

@@ -92,13 +92,14 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
 def _check_section(cls: type, name: str, section: type, known: dict[str, Any]) -> type:
     """The section `name` of `cls`. Raises ConfigError unless it extends those of all parents of `cls`.
 
-    Also for a new one that extends a section of another name, which is a name written wrong.
+    Also for a new one that extends a section of nearly the same name, which is a name written wrong.
     """
     path, inherited = f"{_path(cls)}.{name}", known.get(name)
-    for other, kind in known.items() if inherited is None else ():
-        if _is_section(kind) and issubclass(section, kind):
-            write = f"write `class {other}({_parents(cls, other)}):`"
-            raise ConfigError(f"{path} overrides nothing: it extends section '{other}'; {write}")
+    if inherited is None and (near := difflib.get_close_matches(name, known, n=1)):
+        others = [vars(base).get(near[0]) for base in cls.__mro__[1:]]
+        if any(_is_section(other) and issubclass(section, other) for other in others):
+            write = f"write `class {near[0]}({_parents(cls, near[0])}):`"
+            raise ConfigError(f"{path} overrides nothing: it extends section '{near[0]}'; {write}")
     if inherited is not None and not _is_section(inherited):
         raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
     inherited_sections = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]

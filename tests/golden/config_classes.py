@@ -25,6 +25,7 @@ CLASSES = {
     "a misspelt inner section": (
         "class A(Base):\n    class rewards(Base.rewards):\n        class scale(Base.rewards.scales):\n            pass"
     ),
+    "a misspelt section of a grandparent": "class A(Go1):\n    class envs(Base.env):\n        pass",
     "a section that skips a generation": "class A(Go1):\n    class env(Base.env):\n        pass",
     "a section of one parent of two": (
         "class W(Base):\n    class env(Base.env):\n        pass\nclass A(Go1, W):\n    class env(Go1.env):\n        pass"
