@@ -33,6 +33,8 @@ from legged_mw.view.drive import (
     STEPS,
     Pilot,
     load_script,
+    outside,
+    tour,
 )
 from legged_mw.view.native import window_texts
 from legged_mw.view.panel import BUTTONS, CURVE_SECONDS, KEY_NAMES, Curves, Panel
@@ -425,6 +427,16 @@ def test_a_batch_job_gets_a_video_and_a_sheet(
     launch.watch(FakeStage(), flags("--time", "0.2"), tmp_path, **picture)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["play.mp4", "play.png"]
     assert "(no screen here, and no terminal" in capsys.readouterr().out
+
+
+def test_a_recording_shows_what_a_robot_can() -> None:
+    """Ahead, in a curve, sideways, back, stand; further commands keep their defaults. A task without has no tour."""
+    shown = tour(FOUR, 10.0)
+    assert shown and [entry.time for entry in shown.entries] == [0.0, 3.0, 5.0, 7.0, 9.0]
+    asked = np.array([entry.command for entry in shown.entries])
+    assert (asked[:, 3] == HEIGHT.default).all() and asked[0, 0] > 0.0 > asked[3, 0] and not asked[4, :3].any()
+    assert asked[1, 2] > 0.0 and asked[2, 1] > 0.0 and not any(outside(row, FOUR) for row in asked.tolist())
+    assert tour([HEIGHT], 10.0) is None
 
 
 def test_a_slow_recording_says_how_long_it_takes(

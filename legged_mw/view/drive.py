@@ -272,6 +272,25 @@ class Script:
                 pilot.ask("reset")
 
 
+# share of the time, then shares of vx, vy and yaw rate: 1 the highest, -1 the lowest [ours]
+TOUR = ((0.0, 0.6, 0.0, 0.0), (0.3, 0.5, 0.0, 0.5), (0.5, 0.0, 0.8, 0.0), (0.7, -0.5, 0.0, 0.0), (0.9, 0.0, 0.0, 0.0))
+
+
+def tour(table: Sequence[Command], seconds: float) -> Script | None:
+    """A script of ``seconds`` for a recording: ahead, in a curve, sideways, back, stand. None without velocities."""
+    names = [each.name for each in table]
+    if not set(VELOCITY) <= set(names):
+        return None
+    entries = []
+    for at, *shares in TOUR:
+        command = [each.default for each in table]
+        for column, share in zip(map(names.index, VELOCITY), shares, strict=True):
+            each = table[column]
+            command[column] += abs(share) * ((each.high if share > 0.0 else each.low) - each.default)
+        entries.append(ScriptEntry(at * seconds, command))
+    return Script(entries)
+
+
 def load_script(path: Path | str, table: Sequence[Command]) -> Script:
     """Load a script for a task with these commands. A command outside the trained ranges is an error, not clipped.
 

@@ -14,7 +14,7 @@ from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.machine import has_display
 from legged_mw.view import web
-from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot, load_script, outside, parse_command
+from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot, load_script, outside, parse_command, tour
 from legged_mw.view.native import NativeViewer
 from legged_mw.view.recorder import Recorder, check_format, no_encoder
 from legged_mw.view.session import Outcome, Session
@@ -124,6 +124,9 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, title: str = "le
         pilot = _pilot(stage, args, kind)
     live = kind in ("native", "web")
     seconds = args.time or (script.seconds if script else None) or (None if live else SECONDS)
+    if kind == "video" and script is None and args.command is None:  # nobody drives, and drawn commands may ask little
+        script = tour(stage.command_table, seconds or SECONDS)
+    pilot.everyone = script is not None
     if kind == "web":
         viewer = web_page(stage, pilot, why, args, title)
     elif kind == "video":
@@ -144,13 +147,11 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, title: str = "le
 
 
 def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
-    """The pilot of the shown robots. A script drives all of them."""
+    """The pilot of the shown robots."""
     count = min(stage.num_worlds, ROBOTS_SHOWN)
     if count < stage.num_worlds and kind != "none":
         print(f"{stage.num_worlds} robots, the first {count} of them are shown")
-    pilot = Pilot(stage.command_table, count, args.camera)
-    pilot.everyone = bool(args.commands)
-    return pilot
+    return Pilot(stage.command_table, count, args.camera)
 
 
 def window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
