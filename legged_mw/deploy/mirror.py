@@ -153,9 +153,10 @@ class MirroredStage:
         if newest is None:
             return
         self.latest |= newest
-        if "joint_pos" in newest:
-            self._heard = time.monotonic()
-        if "joint_pos" in newest and np.isfinite([*newest["joint_pos"], *newest["gravity"]]).all():
+        if "joint_pos" not in newest:
+            return
+        self._heard = time.monotonic()
+        if np.isfinite([*newest["joint_pos"], *newest["gravity"]]).all():
             self._data.qpos[:2] = newest["place"][:2]
             angles, gravity = np.array(newest["joint_pos"]), np.array(newest["gravity"])
             place(self._model, self._data, self.contract.joints, angles, gravity, newest["place"][2])
