@@ -309,7 +309,11 @@ def of_project(stored: str) -> str:
 
 def somebodys(stored: str) -> str:
     """Message text on a task's file that is not ``of_project``, with the flag that runs it."""
-    return f"somebody's code, which no run starts by itself: read it, then say --task {shlex.quote(stored[:200])}"
+    name, found = shlex.quote(stored[:200]), False
+    with contextlib.suppress(OSError, ValueError):
+        found = Path(stored).is_file()
+    folder = "" if found or "/" in stored else ", with its folder before the name"  # a config has none
+    return f"somebody's code, which no run starts by itself: read it, then say --task {name}{folder}"
 
 
 def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> list[str]:
