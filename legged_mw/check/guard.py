@@ -254,7 +254,7 @@ def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None
     if other:
         path, now = other[0], _at(env, other[0])
         name = _shown(path)
-        what = f"{name} becomes another tensor; make it once, in __init__, and write in place: {name}.copy_(...)"
+        what = f"{name} becomes another tensor; make it once, in _init_buffers(), and write in place: {name}.copy_(...)"
         if isinstance(before.get(path, now), int | float):
             what = f"{name} is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
         for each in reversed(other):

@@ -190,9 +190,9 @@ def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any
     if name in _HOST_READS:
         return f"{call} reads a tensor to the host; keep it a tensor and compute with that"
     if name in _HOST_WRITES:
-        return f"{call} copies data from the host; make the tensor once, in __init__"
+        return f"{call} copies data from the host; make the tensor once, in _init_buffers()"
     if name in _MOVES or (name == "to" and _moves(args[1:], kwargs)):
-        return f"{call} copies between host and device; make the tensor on self.device, in __init__"
+        return f"{call} copies between host and device; make the tensor on self.device, in _init_buffers()"
     tensors = any(isinstance(arg, Tensor) for arg in args)  # normal(mean, std) takes the device from these tensors
     if name in _FACTORIES and func is getattr(torch, name) and not tensors and not {"device", "out"} & kwargs.keys():
         return f"{call} without a device makes a tensor on the host; add device=self.device"
@@ -206,7 +206,7 @@ def _breach_of_kernel(func: Any, args: tuple) -> str:
         return f"{name.strip('_')} reads a tensor to the host; keep it a tensor and compute with that"
     # a number that is assigned through an index is lifted too, but without a copy
     if name == "lift_fresh" and args[0].dim() > 0:
-        return "a list or an array, as data or as an index, copies from the host; make it a tensor once, in __init__"
+        return "a list or an array, as data or as an index, copies from the host; make it a tensor once, in _init_buffers()"
     if name == "multinomial":
         write = "write (weights / torch.empty_like(weights).exponential_()).argmax(dim=1)"
         return f"multinomial reads a tensor to the host; {write}"
