@@ -100,7 +100,7 @@ def test_a_folder_with_task_robot_and_runs_moves(tmp_path: Path, monkeypatch: py
     assert result.code == 0, result
     line = refused(tmp_path, "play", "--load_run", str(run_folder), "--device", "cpu")
     assert f"{run_folder.relative_to(tmp_path)} is of task 'dog.py', somebody's code" in line and line.endswith(
-        "--task dog.py\n"
+        "--task dog.py, with its folder before the name\n"
     )
 
 
