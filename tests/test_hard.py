@@ -111,7 +111,7 @@ def test_limits_of_angles_and_targets() -> None:
     found = looks(walk(angle=angle, target=target))
     assert found["angle_at_limit"] == {"worst": 0.25, "joint": "hip"}
     assert found["target_at_limit"] == {"worst": 0.1, "joint": "knee"}
-    torques = looks(walk(angle=angle, target=target, servos=False))
+    torques = looks(walk(angle=angle, target=target, of_angles=False))
     assert torques["target_at_limit"]["worst"] == 0.0 and torques["target_step"] is None, "torques [N m] have no range"
     assert torques["angle_at_limit"] == found["angle_at_limit"]
     free = looks(walk(angle=angle, low=np.full(2, -np.inf), high=np.full(2, np.inf)))

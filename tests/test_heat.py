@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_export import untrained
 
 from legged_mw import ROOT
 from legged_mw.deploy import heat_exam
@@ -26,7 +27,6 @@ from legged_mw.utils import motor_heat
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.motor_heat import Ratings
 from legged_mw.utils.task import load_task
-from tests.test_export import untrained
 
 POLICIES = ROOT / "resources/policies"
 GO2 = POLICIES / "go2_flat"

@@ -241,7 +241,7 @@ class Witness:
             limit=torque_limits(model, self._joints),
             joints=contract.joints,
             clock=1.0 / contract.gait.period if contract.gait else None,
-            servos=contract.action.of_angles,
+            of_angles=contract.action.of_angles,
             **record,
         )
 

@@ -130,7 +130,7 @@ class Walk(NamedTuple):
     limit: Array  # (D,) [N m] torque limits; infinite if unknown
     joints: Sequence[str]
     clock: float | None  # [1/s] stride frequency of the policy's gait clock
-    servos: bool = True  # the targets are angles, as above; else torques or speeds, which have no range here
+    of_angles: bool = True  # as of Action: the targets are angles, not torques or speeds, which have no range here
 
 
 def looks(walk: Walk) -> dict[str, Any]:
@@ -157,11 +157,11 @@ def looks(walk: Walk) -> dict[str, Any]:
         "all_down": _number(down.all(axis=1).mean()),
         "none_down": _number(1.0 - down.any(axis=1).mean()),
         "angle_at_limit": angle,
-        "target_at_limit": target if walk.servos else {"worst": 0.0, "joint": ""},
+        "target_at_limit": target if walk.of_angles else {"worst": 0.0, "joint": ""},
         "hit": {"mean": _number(np.mean(hit)), "most": _number(max(hit))} if hit else None,
         "torque_over_limit": _worst(rms / walk.limit, walk.joints) if np.isfinite(walk.limit).any() else None,
         "torque_by_joint": dict(zip(walk.joints, [_number(each) for each in rms / walk.limit], strict=True)),
-        "target_step": _number(np.abs(np.diff(walk.target, axis=0)).mean()) if walk.servos else None,
+        "target_step": _number(np.abs(np.diff(walk.target, axis=0)).mean()) if walk.of_angles else None,
         "fast_share": fast_share(walk.target, walk.period),
         "peak_power": _number(np.abs(walk.torque * walk.speed).sum(axis=1).max()),
     }
