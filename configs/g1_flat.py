@@ -7,7 +7,9 @@ from legged_mw.utils.task import Task
 
 
 class G1FlatCfg(UprightG1, LevelBipedCfg):
-    pass
+    class rewards(UprightG1.rewards, LevelBipedCfg.rewards):
+        # the waist gives way, so that the torso stays level [ours: docs/archive/go2_and_g1.md, a level torso]
+        deviation_weights = {**UprightG1.rewards.deviation_weights, "waist": 0.2}
 
 
 TASK = Task(LeggedRobot, G1FlatCfg, LevelBipedCfgPPO)
