@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from benchmarks import heights, memory, step
+from benchmarks import heights, mean_policy, memory, step
 from legged_mw.envs.legged_robot import LeggedRobot
 
 
@@ -78,3 +80,29 @@ def test_robots_that_walk_backwards_cross_low_stairs() -> None:
     (ground,) = heights.add_ground("stairs_up", "7")
     asked = {"friction": 1.0, "repeats": 1, "engine": "mujoco", "device": "cpu"}
     assert heights.crossed("go2_rough", [ground], speed=-0.6, **asked) == [1.0]
+
+
+def test_a_policy_between_two_trainings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights lie at the share of the way, counts and the config are the second's; other networks are refused, and nothing is written."""
+    for name, weight, count in (("first", 1.0, 5), ("second", 3.0, 9), ("wider", 0.0, 9)):
+        size = 2 + (name == "wider")
+        models = {
+            part: {"weight": torch.full((size,), weight), "count": torch.tensor(count)}
+            for part in ("actor_state_dict", "critic_state_dict")
+        }
+        (tmp_path / name).mkdir()
+        torch.save({"iter": count, "infos": None, **models}, tmp_path / name / f"model_{count}.pt")
+        (tmp_path / name / "config.yaml").write_text(f"task: {name}\n")
+
+    def mean(second: str) -> None:
+        files = [tmp_path / "first/model_5.pt", tmp_path / second / "model_9.pt"]
+        monkeypatch.setattr("sys.argv", ["mean_policy.py", *map(str, files), "0.25", str(tmp_path / f"from_{second}")])
+        mean_policy.main()
+
+    mean("second")
+    mixed = torch.load(tmp_path / "from_second/model_9.pt", weights_only=True)
+    assert mixed["actor_state_dict"]["weight"].tolist() == [1.5, 1.5] and mixed["actor_state_dict"]["count"] == 9
+    assert (tmp_path / "from_second/config.yaml").read_text() == "task: second\n" and mixed["iter"] == 9
+    with pytest.raises(SystemExit, match="different sizes"):
+        mean("wider")
+    assert not (tmp_path / "from_wider").exists()

@@ -51,6 +51,7 @@ WHY_NOT = {
     r"actuator_net|my_anymal|dance\.": "a file of others: test_motors.py, test_motion.py",
     r"legged_mw\.robot |mine_flat": "test_your_own_robot.py runs the same",
     r"^python benchmarks/curve": "draws the curve of a whole training",
+    r"^python benchmarks/mean_policy": "of two trainings: test_benchmarks.py",
     r"--num_envs 40": "a grid of all levels takes seconds to build; the same with fewer runs",
 }
 SMALL = "--num_envs 8 --max_iterations 2 --device cpu --set runner.num_steps_per_env=4 --set runner.exam_interval=0"
