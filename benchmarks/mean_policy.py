@@ -1,6 +1,6 @@
 """A policy between two trainings, as a run: python benchmarks/mean_policy.py FROM/model_750.pt TO/model_2590.pt 0.7 logs/g1_12dof_flat/mean
 
-Each weight is FROM's and, by the share 0 to 1, on the way to TO's. It works where TO began with FROM (train.py --init). The config is TO's.
+Each weight is FROM + share * (TO - FROM). It works where TO began with FROM (train.py --init). The config and the critic are TO's.
 Without an optimizer the run can be played and exported, not resumed. Source: Wortsman et al. 2022, Robust fine-tuning of zero-shot models.
 """
 
@@ -34,10 +34,10 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="the run's folder, which must not exist")
     args = parser.parse_args()
     before, after = (torch.load(path, map_location="cpu", weights_only=True) for path in (args.before, args.after))
-    models = ("actor_state_dict", "critic_state_dict")
-    mixed = {name: between(before[name], after[name], args.share) for name in models}
+    actor = between(before["actor_state_dict"], after["actor_state_dict"], args.share)
     args.out.mkdir(parents=True)
-    torch.save({"iter": after["iter"], "infos": after["infos"], **mixed}, args.out / args.after.name)
+    kept = {name: after[name] for name in ("iter", "infos", "critic_state_dict")}
+    torch.save({**kept, "actor_state_dict": actor}, args.out / args.after.name)
     shutil.copy(args.after.with_name("config.yaml"), args.out)
     print(f"{args.out}: {args.share:g} of the way from {args.before} to {args.after}")
 

@@ -261,13 +261,13 @@ class LevelBipedCfg(UprightBipedCfg):
         period = 0.7  # [s]
 
     class rewards(UprightBipedCfg.rewards):
-        tracking_sigma_end = 0.04  # with 0.08, and weights of 4 and 2 for tracking, one seed of five walks too slowly
+        tracking_sigma_end = 0.04  # five seeds of five walk
         swing_height = 0.1  # [m]
 
         class scales(UprightBipedCfg.rewards.scales):
             tracking_lin_vel = 6.0
             tracking_ang_vel = 3.0
-            orientation = -15.0  # with -5 in all, a sway of 13 degrees costs a twelfth of what feet_phase pays at most
+            orientation = -15.0  # with -5, a sway of 13 degrees costs a sixteenth of what feet_phase pays at most
             trunk_orientation = -25.0  # of a G1's torso, which can roll more than its pelvis
             ang_vel_xy = -0.2
             joint_deviation = -3.0  # of waist and hips

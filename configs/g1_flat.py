@@ -8,7 +8,7 @@ from legged_mw.utils.task import Task
 
 class G1FlatCfg(UprightG1, LevelBipedCfg):
     class rewards(UprightG1.rewards, LevelBipedCfg.rewards):
-        # the waist gives way, so that the torso stays level [ours: docs/archive/go2_and_g1.md, a level torso]
+        # it need not stay at 0, since trunk_orientation prices the torso [ours: docs/archive/go2_and_g1.md, a level torso]
         deviation_weights = {**UprightG1.rewards.deviation_weights, "waist": 0.2}
 
 
