@@ -12,6 +12,8 @@ from torch import Tensor
 from worlds import QUIET, make_env
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import load_task
+from legged_mw.view.playing import NOMINAL
 
 DT = 0.02  # [s] a control step
 MASS = 12.74345  # [kg] of the whole robot
@@ -404,3 +406,17 @@ def test_kicks_are_at_full_strength_without_the_curriculum() -> None:
     env = make_env(4, {"perturbation.kick": True, "perturbation.velocity": [2.0, 2.0]})
     env.reset()
     assert env.perturbation._kick[:, 3].tolist() == [2.0] * 4
+
+
+def test_kicks_that_play_is_asked_for_have_their_strength() -> None:
+    """Of a policy whose kicks grew in training: go2_flat's, played with --set perturbation.kick=true."""
+    task = load_task("go2_flat")
+    for path, value in {**NOMINAL, "perturbation.kick": True, "perturbation.interval": [0.05, 0.05]}.items():
+        if path.split(".")[1] in task.to_dict().get(path.split(".")[0], {}):
+            task.set(path, value)
+    env = task.env_class(task.cfg, "cpu", eager=True)
+    forces = []
+    for _ in range(20):
+        env.step(torch.zeros(1, 12))
+        forces.append(float(env.perturbation.kick_force.abs().max()))
+    assert max(forces) > 1.0

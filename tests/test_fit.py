@@ -27,6 +27,7 @@ from legged_mw.deploy.simulated import MujocoRobot, read_scene
 from legged_mw.deploy.states import CHIRP
 from legged_mw.unitree.client import STEP, UnitreeRobot
 from legged_mw.unitree.link import Received
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 from tests.wires import POLICIES
 
@@ -240,6 +241,27 @@ def test_a_log_that_cannot_be_fitted_is_refused(log: Path, change: Callable[[Dri
     assert [sweep.joint for sweep in fit.read_sweeps(log, recording, CONTRACT, model, [CALF])] == [JOINT]
     with pytest.raises(LogError, match=why):
         fit.read_sweeps(log, change(recording), CONTRACT, model, [CALF])
+
+
+def test_a_joint_without_friction_does_not_widen_the_others() -> None:
+    """Calves of 0.005 +- 0.02 N m would have a factor of 9; hips of 0.5 +- 0.02 have 0.92 to 1.08."""
+
+    def joint(name: str, friction: float) -> fit.FittedJoint:
+        values, deviation = np.ones(6), np.full(6, 1e-3)
+        values[fit.FRICTION], deviation[fit.FRICTION] = friction, 0.02
+        nothing = np.zeros(2)
+        return fit.FittedJoint(CONTRACT.joints.index(name), values, deviation, 0.1, 0.0, nothing, np.zeros((3, 2)))
+
+    hips, calves = [joint(f"{leg}_hip_joint", 0.5) for leg in ("FL", "FR")], [joint("FL_calf_joint", 0.005)]
+    no_log: Any = None
+    found = fit.overrides(fit.Fit(CONTRACT, no_log, hips + calves, 0.0))["domain_rand"]
+    assert found["frictionloss"] == pytest.approx([0.92, 1.08])
+    assert "frictionloss" not in fit.overrides(fit.Fit(CONTRACT, no_log, calves, 0.0))["domain_rand"]
+
+
+def test_a_log_of_which_no_joint_is_left_is_refused(log: Path) -> None:
+    with pytest.raises(UserError, match="--leave_out: joint leaves no joint of .* to fit"):
+        fit.fit_log(log, leave_out=["joint"])
 
 
 def test_a_joint_whose_motion_is_not_explained_is_refused() -> None:

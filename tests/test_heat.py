@@ -82,6 +82,8 @@ def test_the_torque_speed_limit() -> None:
     torque = np.array([[[9.0, 9.9]], [[-9.9, -9.9]]])
     assert motor_heat.at_limit(torque, np.full((2, 1, 2), 20.0), curve, LIMIT).tolist() == [0.0, 0.5]
     assert motor_heat.highest_torque(speeds, ratings(), LIMIT)[-1, 0].tolist() == LIMIT.tolist()  # nothing is known
+    flat = ratings(peak_torque=20.0, knee_speed=10.0)  # without a top speed nothing says how it falls
+    assert motor_heat.highest_torque(speeds, flat, LIMIT)[:, 0, 0].tolist() == [20.0] * 5
     free = motor_heat.at_limit(torque, torque, ratings(), np.full(2, np.inf))
     assert np.isnan(free).all()
 
@@ -102,6 +104,8 @@ def test_what_trips_is_said() -> None:
     assert over["reasons"] == ["hip carries 10.0 N m RMS standing, 1.25 of its continuous rating: it overheats"]
     fine = found(ratings(continuous_torque=11.0, battery_power=100.0))
     assert fine["trips"] is False and fine["phases"]["standing"]["of_limit"] == [0.5, 0.2]
+    fell = {**fine, "switches": True, "switch": None}
+    assert heat._verdict(fell) is None, "what the switch asks of the battery was not measured"
     weak = found(ratings(**WINDING, battery_power=49.0), torque=10.0)  # 25 W in each winding
     assert any("50 W standing, and the battery gives 49 W" in each for each in weak["reasons"])
 

@@ -12,11 +12,13 @@ import torch
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import load_robot
+from legged_mw.motion import look
 from legged_mw.motion.__main__ import feet_of, main
 from legged_mw.motion.foreign import breadth_first, read_motion
 from legged_mw.motion.look import page
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.surface_points import SPACING, spheres_on
 from legged_mw.skills.clip import (
     Clip,
     ClipError,
@@ -92,6 +94,8 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
         np.savetxt(tmp_path / name, table, delimiter=",", header=header, comments="")
         read = read_motion(tmp_path / name, g1)
         assert read.fps == 30.0 and read.joint_names == g1.joint_names
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + (tmp_path / name).read_bytes())  # as Excel saves UTF-8
+        assert len(read_motion(tmp_path / name, g1).root_pos) == len(table)
         np.testing.assert_allclose(read.qpos(), clip.qpos(), atol=1e-7)
     for name, text in (("text.csv", "abc\n"), ("comment.csv", "# abc\n"), ("empty.csv", "")):
         (tmp_path / name).write_text(text)
@@ -122,6 +126,15 @@ def test_bodies_tell_the_order_of_joints(order: str, g1: RobotModel, tmp_path: P
     }
     np.savez(tmp_path / "theirs.npz", **held)
     np.testing.assert_allclose(read_motion(tmp_path / "theirs.npz", g1).qpos(), clip.qpos(), atol=1e-6)
+    for key, value, why in (
+        ("fps", [], "fps must be one number"),
+        ("fps", ["fast"], "fps must be one number"),
+        ("body_pos_w", np.zeros(3), "body_pos_w must be numbers with 3 axes"),
+        ("body_quat_w", held["body_quat_w"][0], "body_quat_w must be numbers with 3 axes"),
+    ):
+        np.savez(tmp_path / "theirs.npz", **{**held, key: value})
+        with pytest.raises(ClipError, match=why):
+            read_motion(tmp_path / "theirs.npz", g1)
 
 
 @pytest.mark.parametrize("file", CLIPS, ids=lambda file: file.stem)
@@ -155,6 +168,35 @@ def test_what_a_robot_cannot_do_is_said(
     mended = read_clip(out)
     assert (mended.fps, len(mended.root_pos)) == (25.0, 26) and "warning: left_knee" not in capsys.readouterr().out
     np.testing.assert_allclose(mended.root_pos[0], moved[50] + [0.0, 0.0, 0.05], atol=1e-6)
+
+
+def test_a_foot_that_turns_about_its_toe_does_not_slide(g1: RobotModel) -> None:
+    """The whole robot turns about the toes' edge at 2 rad/s; then the same robot slides at 1 m/s, seen from its own side."""
+    still = read_clip(CLIPS[0]).of(g1.joint_names, "clip")
+    feet, fps, rows = feet_of(g1), 50.0, np.zeros(6, int)
+    data = posed(g1.physics, still.joint_pos[0], still.qpos()[0, :7])
+    ends = np.concatenate(
+        [
+            data.geom_xpos[g] + spheres @ data.geom_xmat[g].reshape(3, 3).T - [0.0, 0.0, radius]
+            for g in (g1.id("geom", name) for name in feet)
+            for spheres, radius in [spheres_on(g1.physics, g, SPACING)]
+        ]
+    )
+    toe = ends[ends[:, 0].argmax()]
+    turns = from_rotation_vector(np.outer(np.arange(6) * 2.0 / fps, [0.0, 1.0, 0.0]))
+    start, joints = still.qpos()[0, :7], still.joint_pos[rows]
+    heights = -toe * [0.0, 0.0, 1.0]
+    places = toe + rotate(turns, (start[:3] - toe)[None]) + heights
+    tipping = checked(Path("clip"), fps, g1.joint_names, places, multiply(turns, start[None, 3:]), joints)
+    *_, speed = look._feet(g1, tipping, feet)
+    assert speed.max() < 0.05
+    aside = start[:3] + heights + np.outer(np.arange(6) / fps, [0.0, 1.0, 0.0])
+    sliding = checked(Path("clip"), fps, g1.joint_names, aside, np.tile(start[3:], (6, 1)), joints)
+    *_, speed = look._feet(g1, sliding, feet)
+    assert speed[1:].min() == pytest.approx(1.0, abs=0.01)
+    turned = from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
+    facing = checked(Path("clip"), fps, g1.joint_names, aside, np.tile(turned, (6, 1)), joints)
+    np.testing.assert_allclose(look.ClipStage(g1, facing).velocity(), [[1.0, 0.0, 0.0]], atol=1e-6)
 
 
 def test_the_shipped_clips_are_made_by_the_example(monkeypatch: pytest.MonkeyPatch) -> None:

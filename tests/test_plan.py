@@ -97,6 +97,8 @@ def test_time_before_counts(clock: list[float]) -> None:
     """Stopped half way and resumed with what was left, or asked for as much again after its end: it is half done."""
     done = follow(TrainingSchedule(10**6, clock[0] + 30.0, used=30.0), clock, {}, 0.1, begin=300)
     assert done[0] == 0.5 and done[-1] == 1.0 and all(a <= b for a, b in pairwise(done))
+    late = TrainingSchedule(10**6, clock[0] - 1.0, used=30.0)
+    assert late.done == 1.0, "resumed for less time than a start takes: it stays annealed"
     untimed = TrainingSchedule(1000, used=30.0)
     assert untimed.begin(300) == pytest.approx(300 / 999) and untimed.seconds >= 30.0, (
         "its iterations are its plan, its time is kept"

@@ -207,6 +207,18 @@ def test_a_warm_up_goes_on_when_it_is_resumed(tuned: Path, tmp_path: Path) -> No
     assert not torch.equal(third["actor_state_dict"]["mlp.0.weight"], first["actor_state_dict"]["mlp.0.weight"])
 
 
+def test_a_resumed_run_keeps_what_it_began_with(tuned: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "logs/go1_rough_student/run"
+    folder.mkdir(parents=True)
+    shutil.copy(tuned / "config.yaml", folder)
+    shutil.copy(tuned / "model_1.pt", folder)
+    for field, other in (("warm_start.policy", "go1_flat"), ("distillation.teacher", "go1_rough")):
+        more = ["--resume", "--max_iterations", "3", "--set", f"{field}={other}"]
+        result = run("train", tmp_path, "--device", "cpu", "--task", "go1_rough_student", *more)
+        assert result.code and f"not '{other}'; a resumed run keeps it" in result.err
+    assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "model_1.pt"]
+
+
 def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: LeggedRobot) -> None:
     """A checkpoint of the last iteration of the warm-up: what follows begins at the lowest learning rate, as it would have."""
     task = load_task("go1_rough_student")

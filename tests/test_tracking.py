@@ -13,7 +13,7 @@ from legged_mw.check.guard import check_recordable
 from legged_mw.deploy.exam import run_skill
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval.perform import machine
+from legged_mw.eval.perform import machine, prepare
 from legged_mw.eval.skills import PUSH_EVERY, ExamGround, Recording, TrackingExam
 from legged_mw.export.exporter import export
 from legged_mw.skills.clip import Clip, read_clip, save_clip
@@ -57,6 +57,19 @@ def test_worlds_begin_on_the_reference(device: str) -> None:
 
 def test_a_field_that_a_clip_does_not_read_may_have_its_default() -> None:
     make(**{"init_state.yaw_range": MotionTrackingCfg.init_state.yaw_range})
+
+
+def test_the_exams_changes_are_ones_that_the_task_takes() -> None:
+    """How a robot begins is left as it is; a clip that no frame is held after is judged to its last frame too."""
+    task = load_task("g1_track")
+    task.set("motion.hold_s", 0.0)
+    prepare(task)
+    task.cfg.check()
+    assert task.cfg.motion.hold_s == 1.0 and not task.cfg.motion.random_start
+
+
+def test_starts_may_be_drawn_from_every_frame() -> None:
+    make(worlds=2, **{"motion.bin_s": 0.005}).step(torch.zeros(2, 29))
 
 
 def test_errors_are_taken_at_the_anchor() -> None:

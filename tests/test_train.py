@@ -33,7 +33,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export.network import save_onnx
 from legged_mw.rl.iteration_log import console_rows, curves
 from legged_mw.rl.learner_config import rsl_rl_config
-from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.policies import act, find_policy, load_policy
 from legged_mw.rl.run_folder import checkpoints, find_checkpoint, find_run, new_run, runs
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.utils.config import ConfigError, load_yaml
@@ -329,6 +329,13 @@ def test_the_newest_checkpoint_is_the_highest_number(tmp_path: Path) -> None:
     assert find_checkpoint(tmp_path, -1).name == "model_10.pt" and find_checkpoint(tmp_path, 9).name == "model_9.pt"
     with pytest.raises(ConfigError, match="no checkpoint 3 in .*; there are: 9, 10"):
         find_checkpoint(tmp_path, 3)
+
+
+def test_an_export_has_no_checkpoints() -> None:
+    task = load_task("go1_flat")
+    for name in ("shipped", str(ROOT / "resources/policies/go1_flat")):
+        with pytest.raises(ConfigError, match="--checkpoint 77: the .* has no checkpoints; name a run"):
+            find_policy(task, name, 77)
 
 
 def test_runs_of_the_same_second_do_not_share_a_folder(tmp_path: Path) -> None:

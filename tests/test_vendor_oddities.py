@@ -357,6 +357,22 @@ def test_the_vendors_own_file_is_never_overwritten(tmp_path: Path) -> None:
     assert file.read_text() == text
 
 
+def test_meshes_that_lie_where_a_draft_puts_its_own_are_never_overwritten(tmp_path: Path) -> None:
+    """Not without --force, and with it not those that the source itself names."""
+    parts = tmp_path / "mine_parts"
+    parts.mkdir()
+    write_stl(ball(20), parts / "hull.stl")
+    asset = '<asset><mesh name="hull" file="mine_parts/hull.stl" scale="0.1 0.1 0.1"/></asset>'
+    look = '<geom type="mesh" mesh="hull" mass="0" contype="0" conaffinity="0"/>'
+    file, kept = toy(tmp_path, inside=look, extra=asset), (parts / "hull.stl").read_bytes()
+    with pytest.raises(UserError, match="mine_parts exists; say another name"):
+        targets("mine", tmp_path, file)
+    text = as_mjcf("mine", file, tmp_path, parts)
+    assert (parts / "hull.stl").read_bytes() == kept and 'file="mine_parts/hull_.stl"' in text
+    (tmp_path / "mine.xml").write_text(text)
+    assert read_robot(tmp_path / "mine.xml").spec.mesh("hull") is not None
+
+
 def test_a_class_may_name_a_material_that_is_not_there(tmp_path: Path) -> None:
     """Lite3 of DeepRobotics: each geom of the class overrides it by nothing, which MuJoCo's writer leaves out."""
     default = '<default><default class="look"><geom material="none"/></default></default>'

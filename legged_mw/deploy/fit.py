@@ -138,6 +138,8 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
         if not any(part in name for name in contract.joints):
             raise UserError(f"--leave_out: {unknown('joint', part, contract.joints, shown(path))}")
     selected = [name for name in joints or contract.joints if not any(part in name for part in leave_out)]
+    if not selected:
+        raise UserError(f"--leave_out: {', '.join(leave_out)} leaves no joint of {shown(path)} to fit")
     sweeps = read_sweeps(path, recording, contract, scene.model, selected)
     hangs = trunk_of(scene.model)
     turned = between(scene.model, hangs)
@@ -448,7 +450,8 @@ def table(fit: Fit) -> str:
 def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
     """Fields of the task's config: means over joints of the same kind, and ranges that include each joint's value.
 
-    A range is two standard deviations wider on each side.
+    A range is two standard deviations wider on each side. Factors of armature and friction loss are of the joints whose
+    mean is larger than that: of a joint that has hardly any, a factor says nothing.
     """
     values, deviation = fit.values, fit.deviation
     kinds = _kinds([fit.contract.joints[each.joint] for each in fit.joints])
@@ -456,8 +459,9 @@ def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
     for field, column in (("armature", ARMATURE), ("frictionloss", FRICTION)):
         fitted, spread = values[:, column], deviation[:, column]
         tables[field] = {kind: _short(fitted[[each == kind for each in kinds]].mean()) for kind in dict.fromkeys(kinds)}
-        mean = np.maximum([tables[field][kind] for kind in kinds], 1e-6)
-        ranges[field] = _range(fitted / mean, spread / mean, 1e-3)
+        mean = np.array([tables[field][kind] for kind in kinds])
+        if (sure := mean > 2.0 * spread).any():
+            ranges[field] = _range(fitted[sure] / mean[sure], spread[sure] / mean[sure], 1e-3)
     ranges["stiffness"] = _range(values[:, GAIN], deviation[:, GAIN], 1e-3)
     own = fit.contract.damping[[each.joint for each in fit.joints]]
     if own.all():

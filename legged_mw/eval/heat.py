@@ -141,7 +141,8 @@ def _verdict(result: Mapping[str, Any]) -> bool | None:
     """False if all ratings are known, else None. For heat either THERMAL or the continuous torque is enough."""
     lacking = set(result["unknown"])
     heat = "continuous_torque" in lacking and bool(lacking & set(THERMAL))
-    return None if heat or BATTERY in lacking or None in result["phases"].values() else False
+    fell = None in result["phases"].values() or (result["switches"] and result["switch"] is None)
+    return None if heat or BATTERY in lacking or fell else False
 
 
 # ---- text -----------------------------------------------------------------------------------------------------------

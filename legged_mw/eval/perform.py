@@ -22,6 +22,7 @@ from legged_mw.eval.skills import ExamGround, ExamRobot, Floats, Recording, Refe
 from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.simulation import say_overflow
 from legged_mw.skills.motion_tracking import MotionTracking
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask
 
@@ -39,8 +40,9 @@ def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
 
 def overrides(task: LoadedTask) -> dict[str, Any]:
     """The exam's changes to the config. Fields that the task lacks are left out."""
-    # keep the task's own termination rules
-    common = {path: value for path, value in rollout.OVERRIDES.items() if not path.startswith("termination.")}
+    # keep the task's own termination rules, and how a robot begins that tracks a motion
+    kept = ("termination.", "init_state.") if isinstance(task.cfg, MotionTrackingCfg) else ("termination.",)
+    common = {path: value for path, value in rollout.OVERRIDES.items() if not path.startswith(kept)}
     changes, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
     return {path: value for path, value in changes.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
 

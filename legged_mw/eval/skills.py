@@ -352,6 +352,7 @@ class TrackingExam(Skill):
     )
     overrides = {
         "motion.random_start": False,
+        "motion.hold_s": 1.0,  # an episode that ends with the clip would end before its last frame is judged
         **{f"termination.{name}": FAR for name in ("max_anchor_height", "max_anchor_tilt", "max_end_height")},
     }
 

@@ -38,7 +38,7 @@ def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip
 def _read_csv(path: Path, robot: RobotModel, fps: float) -> Clip:
     """One line per frame: root x, y, z [m], quaternion x, y, z, w, joints [rad] in the order of the robot's file."""
     try:
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.partition("#")[0].strip()]
+        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.partition("#")[0].strip()]
         if lines and not _is_number(lines[0].split(",")[0]):  # a header with names
             del lines[0]
         if not lines:
@@ -70,7 +70,15 @@ def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: fl
             raise ClipError(
                 f"{path} has no '{key}'; a motion of BeyondMimic or mjlab has joint_pos, body_pos_w, body_quat_w and fps"
             )
-    rate = float(np.ravel(held["fps"])[0]) if "fps" in held else fps
+    for key, axes in (("joint_pos", 2), ("body_pos_w", 3), ("body_quat_w", 3)):
+        if held[key].ndim != axes or not np.issubdtype(held[key].dtype, np.number):
+            raise ClipError(
+                f"{path}: {key} must be numbers with {axes} axes; it is {held[key].dtype} {held[key].shape}"
+            )
+    said = np.ravel(held.get("fps", fps or 0.0))
+    if said.size != 1 or not np.issubdtype(said.dtype, np.number):
+        raise ClipError(f"{path}: fps must be one number; it is {said.dtype} {said.shape}")
+    rate = float(said[0])
     if not rate:
         raise ClipError(f"{path} does not say how many frames a second it has; say --fps")
     places, turns = held["body_pos_w"], held["body_quat_w"]

@@ -10,7 +10,7 @@ import numpy as np
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.surface_points import SPACING, spheres_on
-from legged_mw.skills.clip import Clip, Floats
+from legged_mw.skills.clip import Clip, Floats, conjugate, rotate
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
 
@@ -59,25 +59,31 @@ def _when(clip: Clip, values: Floats) -> str:
 
 
 def _feet(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> tuple[Floats, Floats]:
-    """The height of each foot's lowest point (T, bodies) [m], and the speed of the fastest standing foot (T,) [m/s]."""
-    model, data, heights, places = robot.physics, mujoco.MjData(robot.physics), [], []
-    geoms = [robot.id("geom", name) for name in feet]
-    bodies, points = (
-        sorted({int(model.geom_bodyid[geom]) for geom in geoms}),
-        {geom: spheres_on(model, geom, SPACING) for geom in geoms},
-    )
+    """The height of each foot's lowest point (T, bodies) [m], and the speed of the fastest standing foot (T,) [m/s].
+
+    The speed is that of the lowest point, so a foot that turns about its toe does not slide.
+    """
+    model, data, heights, speeds = robot.physics, mujoco.MjData(robot.physics), [], []
+    points = {geom: spheres_on(model, geom, SPACING) for geom in (robot.id("geom", name) for name in feet)}
+    bodies = sorted({int(model.geom_bodyid[geom]) for geom in points})
+    lowest = dict.fromkeys(bodies, np.zeros(3))  # of the frame before, body frame
+    places = lowest  # the same, world frame
     for row in clip.qpos():
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
-        low = dict.fromkeys(bodies, np.inf)
+        turns = {body: data.xmat[body].reshape(3, 3) for body in bodies}
+        now = {body: data.xpos[body] + turns[body] @ lowest[body] for body in bodies}
+        speeds.append([np.linalg.norm((now[body] - places[body])[:2]) * clip.fps for body in bodies])
+        places = {body: np.full(3, np.inf) for body in bodies}
         for geom, (spheres, radius) in points.items():
-            body, down = int(model.geom_bodyid[geom]), data.geom_xmat[geom, 6:]
-            low[body] = min(low[body], float(data.geom_xpos[geom, 2] + (spheres @ down).min() - radius))
-        heights.append([*low.values()])
-        places.append(data.xpos[bodies, :2].copy())
-    height, speed = np.array(heights), np.linalg.norm(np.diff(places, axis=0), axis=2) * clip.fps
+            body = int(model.geom_bodyid[geom])
+            ends = data.geom_xpos[geom] + spheres @ data.geom_xmat[geom].reshape(3, 3).T - [0.0, 0.0, radius]
+            places[body] = min(places[body], ends[ends[:, 2].argmin()], key=lambda place: place[2])
+        lowest = {body: turns[body].T @ (places[body] - data.xpos[body]) for body in bodies}
+        heights.append([places[body][2] for body in bodies])
+    height, speed = np.array(heights), np.array(speeds)
     standing = (height[1:] < NEAR) & (height[:-1] < NEAR)
-    return height, np.r_[0.0, np.where(standing, speed, 0.0).max(axis=1)]
+    return height, np.r_[0.0, np.where(standing, speed[1:], 0.0).max(axis=1)]
 
 
 class ClipStage:
@@ -89,6 +95,7 @@ class ClipStage:
     def __init__(self, robot: RobotModel, clip: Clip) -> None:
         self.spec: mujoco.MjSpec = visual_spec(robot)
         self.dt, self._qpos, self._qvel, self._frame = 1.0 / clip.fps, clip.qpos(), clip.qvel(), 0
+        self._imu = robot.physics.site(robot.imu).pos if robot.imu else np.zeros(3)
 
     def step(self, commands: FloatArray | None) -> None:
         self._frame = (self._frame + 1) % len(self._qpos)
@@ -97,8 +104,9 @@ class ClipStage:
         return np.zeros((1, 0))
 
     def velocity(self) -> FloatArray:
-        vx, vy, *_, yaw_rate = self._qvel[self._frame, :6]
-        return np.array([[vx, vy, yaw_rate]])
+        velocity, turning = np.split(self._qvel[self._frame, :6], 2)  # of the root: world, body
+        at_imu = rotate(conjugate(self._qpos[self._frame, 3:7]), velocity) + np.cross(turning, self._imu)
+        return np.array([[*at_imu[:2], turning[2]]])
 
     def believed_velocity(self) -> FloatArray | None:
         return None

@@ -70,6 +70,7 @@ def find_policy(
     """The named run or export, else the latest run, else the policy that ships with the task."""
     folder = experiment_folder(task, experiment)
     if run == "shipped":
+        _refuse_checkpoint("the policy that ships", checkpoint)
         return shipped_policy(task, "--load_run shipped: ")
     if run is not None or checkpoint != -1 or runs(folder):
         return _run_or_export(folder, run or "-1", checkpoint)
@@ -123,9 +124,15 @@ def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> PolicyS
     folder = typed(name)
     finish_moving(folder)  # of an export whose process was killed
     if (folder / NETWORK_FILE).is_file():
+        _refuse_checkpoint(f"the export {name}", checkpoint)
         return PolicySource(check_folder(folder), folder / NETWORK_FILE, shipped=False)
     run = find_run(experiment, name)
     return PolicySource(run, find_checkpoint(run, checkpoint), shipped=False)
+
+
+def _refuse_checkpoint(policy: str, checkpoint: int) -> None:
+    if checkpoint != -1:
+        raise ConfigError(f"--checkpoint {checkpoint}: {policy} has no checkpoints; name a run, or leave it out")
 
 
 def shipped_policy(task: LoadedTask, flag: str) -> PolicySource:

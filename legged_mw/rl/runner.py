@@ -545,7 +545,7 @@ class TrainingSchedule:
         self.last = self._wanted = last  # with a deadline ``last`` is an estimate
         self.deadline, self._used, self._begun = deadline, used, time.time()
         room = max(deadline - self._begun, 0.0) if deadline else 0.0
-        self.done = used / (used + room) if room else 0.0
+        self.done = used / (used + room) if deadline and used else 0.0
         self._first, self._before, self._times = True, self._begun, deque[float](maxlen=_WINDOW)
 
     @property

@@ -127,6 +127,12 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
 def _find_others(task: LoadedTask, start: Start) -> Start:
     """Find the teacher and the warm start that the config names. A resumed run uses its copy of the teacher."""
     teacher, begin = task.train.distillation.teacher, task.train.warm_start.policy
+    if start.run:
+        config = load_yaml(start.run / CONFIG_FILE)
+        for section, field, now in (("distillation", "teacher", teacher), ("warm_start", "policy", begin)):
+            if now != (before := config.get(section, {}).get(field, "")):
+                asked = f"{section}.{field}: {shown(start.run)} has '{before}', not '{now}'"
+                raise ConfigError(f"{asked}; a resumed run keeps it: leave out --resume for another")
     if teacher:
         teacher = str(start.run / TEACHER) if start.run else teacher
         start = start._replace(teacher=find_trained(teacher, start.experiment, "--teacher", task))

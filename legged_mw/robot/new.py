@@ -95,7 +95,7 @@ def targets(name: str, folder: Path, file: Path, force: bool = False) -> tuple[P
         is_own = robot.exists() and file.exists() and robot.samefile(file) and not stands_alone(file)
     if is_own:
         raise UserError(f"{shown(robot)} is the robot's own file and is not overwritten; use another name or --out DIR")
-    there = [path for path in (robot, config) if path.exists()]
+    there = [path for path in (robot, config, folder / f"{name}_parts") if path.exists()]
     if there and not force:
         raise UserError(
             f"{' and '.join(shown(path) for path in there)} exists; say another name or --out DIR, or --force to overwrite"
@@ -339,8 +339,9 @@ def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[P
     long = [mesh for mesh in spec.meshes if len(mesh.userface) > _SHORT and not len(mesh.usertexcoord)]
     if paths or long:
         parts.mkdir(exist_ok=True)
+    own = [path for path in paths if path.resolve().parent == parts.resolve()]  # the source's files are not overwritten
     for mesh in long:
-        place = parts.resolve() / _unused(f"{mesh.name}.stl", new.values())
+        place = parts.resolve() / _unused(f"{mesh.name}.stl", [*new.values(), *own])
         write_stl(Triangles(np.reshape(mesh.uservert, (-1, 3)), np.reshape(mesh.userface, (-1, 3))), place)
         mesh.file, mesh.uservert, mesh.userface, mesh.usernormal = str(place), [], [], []
         new[place] = place
@@ -351,7 +352,7 @@ def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[P
             with suppress(ValueError):  # only MuJoCo can read it, such as a .msh
                 look = thinned(path, FACES_OF_LOOKS)
         name = path.name if look is None else f"{path.stem}.stl"
-        new[path] = parts.resolve() / _unused(name, new.values())
+        new[path] = parts.resolve() / _unused(name, [*new.values(), *own])
         if look is None:
             shutil.copyfile(path, new[path])
             continue

@@ -181,7 +181,7 @@ class MotionTracking(RobotTask):
         self.kinematics = Kinematics(self.robot.physics, bodies, self.device)
         self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
         self.clips = load_clips(self.cfg, self.robot.joint_names, 1.0 / self.dt)
-        frames = {"held": round(motion.hold_s / self.dt), "bin_frames": round(motion.bin_s / self.dt)}
+        frames = {"held": round(motion.hold_s / self.dt), "bin_frames": max(1, round(motion.bin_s / self.dt))}
         self.reference = self.remember(Reference(self.clips, self.kinematics, self.num_envs, self.device, **frames))
         ranges = [*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel]
         self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)

@@ -62,7 +62,8 @@ def highest_torque(speed: Floats, ratings: Ratings, limit: Floats) -> Floats:
     """
     peak = np.where(np.isnan(ratings.peak_torque), limit, ratings.peak_torque)
     top = np.where(np.isnan(ratings.top_speed), np.inf, ratings.top_speed)
-    knee = np.minimum(np.where(np.isnan(ratings.knee_speed), top, ratings.knee_speed), top)
+    known = ~np.isnan(ratings.knee_speed) & np.isfinite(top)  # without a top speed nothing says how fast it falls
+    knee = np.where(known, np.minimum(ratings.knee_speed, top), top)
     with np.errstate(divide="ignore", invalid="ignore"):
         left = np.where(np.abs(speed) <= knee, 1.0, (top - np.abs(speed)) / (top - knee))
     return peak * np.clip(np.nan_to_num(left, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)

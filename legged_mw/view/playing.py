@@ -52,6 +52,7 @@ NOMINAL = {  # overrides of the trained config for playing
     "noise.level": 0.0,
     "perturbation.kick": False,
     "perturbation.push": False,
+    "perturbation.curriculum": False,  # kicks that are asked for have their full strength
     "domain_rand.enable": False,
     "commands.curriculum": False,
     "gait.random_start": False,
@@ -367,10 +368,11 @@ def _stamp(path: Path) -> int:
 def watch_training(task: LoadedTask, runner: Runner, folder: Path) -> None:
     """Open the viewer of a starting run: a window, or without a screen a web page. It closes with the training."""
     if not checkpoints(folder):
+        first = f"model_{runner.current_learning_iteration}.pt"  # not 0 where another run is branched
         try:
-            runner.save(str(folder / "model_0.pt"))  # the viewer's first policy
+            runner.save(str(folder / first))  # the viewer's first policy
         except (OSError, MemoryError) as error:
-            print(f"WARNING: no viewer opens: cannot write model_0.pt ({reason_of(error)})", flush=True)
+            print(f"WARNING: no viewer opens: cannot write {first} ({reason_of(error)})", flush=True)
             return
     name = task.name if task.ships else str(task.path)
     window = "native" if has_display() else "web"
