@@ -409,7 +409,7 @@ def test_kicks_are_at_full_strength_without_the_curriculum() -> None:
 
 
 def test_kicks_that_play_is_asked_for_have_their_strength() -> None:
-    """Of a policy whose kicks grew in training: go2_flat's, played with --set perturbation.kick=true."""
+    """go2_flat's kicks grew in training; play.py --set perturbation.kick=true asks for them at full strength."""
     task = load_task("go2_flat")
     for path, value in {**NOMINAL, "perturbation.kick": True, "perturbation.interval": [0.05, 0.05]}.items():
         if path.split(".")[1] in task.to_dict().get(path.split(".")[0], {}):

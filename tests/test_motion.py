@@ -131,6 +131,8 @@ def test_bodies_tell_the_order_of_joints(order: str, g1: RobotModel, tmp_path: P
         ("fps", ["fast"], "fps must be one number"),
         ("body_pos_w", np.zeros(3), "body_pos_w must be numbers with 3 axes"),
         ("body_quat_w", held["body_quat_w"][0], "body_quat_w must be numbers with 3 axes"),
+        ("body_quat_w", held["body_quat_w"][:, :0], "body_quat_w must be numbers with 3 axes"),
+        ("body_pos_w", held["body_pos_w"] * np.nan, "another robot|finite|NaN|nan"),
     ):
         np.savez(tmp_path / "theirs.npz", **{**held, key: value})
         with pytest.raises(ClipError, match=why):
@@ -171,7 +173,7 @@ def test_what_a_robot_cannot_do_is_said(
 
 
 def test_a_foot_that_turns_about_its_toe_does_not_slide(g1: RobotModel) -> None:
-    """The whole robot turns about the toes' edge at 2 rad/s; then the same robot slides at 1 m/s, seen from its own side."""
+    """The robot turns about its toes' edge at 2 rad/s; then it slides at 1 m/s. ClipStage gives velocities of the IMU, body frame."""
     still = read_clip(CLIPS[0]).of(g1.joint_names, "clip")
     feet, fps, rows = feet_of(g1), 50.0, np.zeros(6, int)
     data = posed(g1.physics, still.joint_pos[0], still.qpos()[0, :7])
@@ -197,6 +199,10 @@ def test_a_foot_that_turns_about_its_toe_does_not_slide(g1: RobotModel) -> None:
     turned = from_rotation_vector(np.array([0.0, 0.0, np.pi / 2]))
     facing = checked(Path("clip"), fps, g1.joint_names, aside, np.tile(turned, (6, 1)), joints)
     np.testing.assert_allclose(look.ClipStage(g1, facing).velocity(), [[1.0, 0.0, 0.0]], atol=1e-6)
+    turns = from_rotation_vector(np.outer(np.arange(6) / fps, [0.0, 0.0, 1.0]))
+    on_the_spot = checked(Path("clip"), fps, g1.joint_names, np.tile(start[:3], (6, 1)), turns, joints)
+    ahead, left, _ = g1.physics.site(g1.imu).pos
+    np.testing.assert_allclose(look.ClipStage(g1, on_the_spot).velocity(), [[-left, ahead, 1.0]], atol=1e-5)
 
 
 def test_the_shipped_clips_are_made_by_the_example(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,11 +212,13 @@ def test_a_resumed_run_keeps_what_it_began_with(tuned: Path, tmp_path: Path) -> 
     folder.mkdir(parents=True)
     shutil.copy(tuned / "config.yaml", folder)
     shutil.copy(tuned / "model_1.pt", folder)
-    for field, other in (("warm_start.policy", "go1_flat"), ("distillation.teacher", "go1_rough")):
-        more = ["--resume", "--max_iterations", "3", "--set", f"{field}={other}"]
-        result = run("train", tmp_path, "--device", "cpu", "--task", "go1_rough_student", *more)
-        assert result.code and f"not '{other}'; a resumed run keeps it" in result.err
-    assert sorted(path.name for path in folder.iterdir()) == ["config.yaml", "model_1.pt"]
+    before = load_yaml(folder / "config.yaml")
+    more = ["--max_iterations", "2", "--set", "warm_start.policy=go1_flat", "--set", "distillation.teacher=go1_rough"]
+    result = run("train", tmp_path, "--device", "cpu", "--task", "go1_rough_student", "--resume", *more)
+    assert result.code == 0, result.err
+    assert "keeps its warm_start.policy: " in result.out and "keeps its distillation.teacher: '', not" in result.out
+    after = load_yaml(folder / "config.yaml")
+    assert after["warm_start"] == before["warm_start"] and after["distillation"] == before["distillation"]
 
 
 def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: LeggedRobot) -> None:

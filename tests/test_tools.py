@@ -663,9 +663,9 @@ def test_a_viewer_outlives_a_thinned_checkpoint(tmp_path: Path) -> None:
 
 
 def test_a_training_goes_on_without_a_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runner: Any = SimpleNamespace(save=lambda path: Path(path).write_bytes(b""))
+    runner: Any = SimpleNamespace(save=lambda path: Path(path).write_bytes(b""), current_learning_iteration=7)
     playing.watch_training(load_task("go1_flat"), runner, tmp_path / "gone")
-    assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No such file or directory)\n"
+    assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_7.pt (No such file or directory)\n"
 
 
 def test_a_viewer_ends_with_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

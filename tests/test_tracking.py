@@ -60,7 +60,7 @@ def test_a_field_that_a_clip_does_not_read_may_have_its_default() -> None:
 
 
 def test_the_exams_changes_are_ones_that_the_task_takes() -> None:
-    """How a robot begins is left as it is; a clip that no frame is held after is judged to its last frame too."""
+    """It keeps its init_state; a clip whose last frame is not held is judged to its last frame too."""
     task = load_task("g1_track")
     task.set("motion.hold_s", 0.0)
     prepare(task)
@@ -69,7 +69,8 @@ def test_the_exams_changes_are_ones_that_the_task_takes() -> None:
 
 
 def test_starts_may_be_drawn_from_every_frame() -> None:
-    make(worlds=2, **{"motion.bin_s": 0.005}).step(torch.zeros(2, 29))
+    env = make(worlds=2, **{"motion.bin_s": 0.005})
+    assert len(env.reference.failures) == sum(len(clip.root_pos) - 1 for clip in env.clips)
 
 
 def test_errors_are_taken_at_the_anchor() -> None:

@@ -448,10 +448,11 @@ def table(fit: Fit) -> str:
 
 
 def overrides(fit: Fit) -> dict[str, dict[str, Any]]:
-    """Fields of the task's config: means over joints of the same kind, and ranges that include each joint's value.
+    """Fields of the task's config: means over joints of the same kind, and ranges.
 
-    A range is two standard deviations wider on each side. Factors of armature and friction loss are of the joints whose
-    mean is larger than that: of a joint that has hardly any, a factor says nothing.
+    A range includes each joint's value and is two standard deviations wider on each side. Those of armature and friction
+    loss are of the joints whose mean is larger than two standard deviations: of a joint that has hardly any, a factor
+    says nothing.
     """
     values, deviation = fit.values, fit.deviation
     kinds = _kinds([fit.contract.joints[each.joint] for each in fit.joints])

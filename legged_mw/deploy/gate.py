@@ -104,10 +104,9 @@ def main(export: Export) -> None:
 def find_export(name: str, checkpoint: int = -1) -> Path | None:
     """The export folder of ``name``: an export, a run or a shipped policy. None: the run has no export yet."""
     folder = typed(name)
-    if checkpoint == -1:
-        for path in (folder, folder / "export"):
-            if (path / CONTRACT_FILE).is_file():
-                return find(str(path))
+    for path in (folder, *([folder / "export"] if checkpoint == -1 else [])):  # an export has no checkpoints
+        if (path / CONTRACT_FILE).is_file():
+            return find(str(path))
     return None if folder.exists() or Path("logs", name).exists() or checkpoint != -1 else _shipped(name)
 
 

@@ -138,7 +138,7 @@ def reasons(result: Mapping[str, Any]) -> list[str]:
 
 
 def _verdict(result: Mapping[str, Any]) -> bool | None:
-    """False if all ratings are known, else None. For heat either THERMAL or the continuous torque is enough."""
+    """False if all ratings are known and the robot stayed up, else None. For heat either THERMAL or the continuous torque is enough."""
     lacking = set(result["unknown"])
     heat = "continuous_torque" in lacking and bool(lacking & set(THERMAL))
     fell = None in result["phases"].values() or (result["switches"] and result["switch"] is None)

@@ -40,7 +40,7 @@ def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
 
 def overrides(task: LoadedTask) -> dict[str, Any]:
     """The exam's changes to the config. Fields that the task lacks are left out."""
-    # keep the task's own termination rules, and how a robot begins that tracks a motion
+    # the task keeps its termination rules; one that tracks a motion keeps its init_state too
     kept = ("termination.", "init_state.") if isinstance(task.cfg, MotionTrackingCfg) else ("termination.",)
     common = {path: value for path, value in rollout.OVERRIDES.items() if not path.startswith(kept)}
     changes, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()

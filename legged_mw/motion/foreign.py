@@ -71,12 +71,12 @@ def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: fl
                 f"{path} has no '{key}'; a motion of BeyondMimic or mjlab has joint_pos, body_pos_w, body_quat_w and fps"
             )
     for key, axes in (("joint_pos", 2), ("body_pos_w", 3), ("body_quat_w", 3)):
-        if held[key].ndim != axes or not np.issubdtype(held[key].dtype, np.number):
+        if held[key].ndim != axes or 0 in held[key].shape or held[key].dtype.kind not in "fiu":
             raise ClipError(
                 f"{path}: {key} must be numbers with {axes} axes; it is {held[key].dtype} {held[key].shape}"
             )
     said = np.ravel(held.get("fps", fps or 0.0))
-    if said.size != 1 or not np.issubdtype(said.dtype, np.number):
+    if said.size != 1 or said.dtype.kind not in "fiu":
         raise ClipError(f"{path}: fps must be one number; it is {said.dtype} {said.shape}")
     rate = float(said[0])
     if not rate:
@@ -93,7 +93,7 @@ def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: fl
             clip,
         )
     apart, clip = min(distances.values(), key=lambda each: each[0])
-    if apart > APART:
+    if not apart <= APART:  # NaN neither
         raise ClipError(
             f"{path}: with its joints in either order ({', '.join(distances)}) bodies are {apart:.2f} m from where it says; another robot?"
         )

@@ -131,8 +131,9 @@ def _find_others(task: LoadedTask, start: Start) -> Start:
         config = load_yaml(start.run / CONFIG_FILE)
         for section, field, now in (("distillation", "teacher", teacher), ("warm_start", "policy", begin)):
             if now != (before := config.get(section, {}).get(field, "")):
-                asked = f"{section}.{field}: {shown(start.run)} has '{before}', not '{now}'"
-                raise ConfigError(f"{asked}; a resumed run keeps it: leave out --resume for another")
+                print(f"a resumed run keeps its {section}.{field}: '{before}', not '{now}'")
+                task.update({section: {field: before}}, where=shown(start.run))
+        teacher, begin = task.train.distillation.teacher, task.train.warm_start.policy
     if teacher:
         teacher = str(start.run / TEACHER) if start.run else teacher
         start = start._replace(teacher=find_trained(teacher, start.experiment, "--teacher", task))

@@ -54,7 +54,7 @@ def main() -> None:
         return
     if args.new:
         # raise before the page is printed
-        new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force)
+        new.targets(args.new, writable(args.out, "--out", folder=True), file, args.force, args.pack)
     proposal = draft(file, args.sim)
     if args.new:
         new.refuse_wheels(proposal, file)

@@ -83,10 +83,11 @@ _COMMENTS = {
 }
 
 
-def targets(name: str, folder: Path, file: Path, force: bool = False) -> tuple[Path, Path]:
+def targets(name: str, folder: Path, file: Path, force: bool = False, pack: bool = True) -> tuple[Path, Path]:
     """The paths of the two files of the task ``name`` for the robot in ``file``.
 
-    Raises UserError for an invalid name or an existing file; ``force`` allows one that is not ``file``.
+    Raises UserError for an invalid name, an existing file, or with ``pack`` an existing folder of its meshes; ``force``
+    allows those that are not ``file``.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise UserError(f"--new {name}: a name begins with a letter and has letters, digits and _ only")
@@ -95,7 +96,8 @@ def targets(name: str, folder: Path, file: Path, force: bool = False) -> tuple[P
         is_own = robot.exists() and file.exists() and robot.samefile(file) and not stands_alone(file)
     if is_own:
         raise UserError(f"{shown(robot)} is the robot's own file and is not overwritten; use another name or --out DIR")
-    there = [path for path in (robot, config, folder / f"{name}_parts") if path.exists()]
+    parts = [folder / f"{name}_parts"] if pack and not stands_alone(file) else []
+    there = [path for path in (robot, config, *parts) if path.exists()]
     if there and not force:
         raise UserError(
             f"{' and '.join(shown(path) for path in there)} exists; say another name or --out DIR, or --force to overwrite"
@@ -117,7 +119,7 @@ def write(
 
     ``mirrors``: the robot is symmetric, see ``has_mirror``. Returns what was written. Raises UserError.
     """
-    robot, config = targets(name, folder, file, force)
+    robot, config = targets(name, folder, file, force, pack)
     parts = folder / f"{name}_parts"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -339,7 +341,8 @@ def _copied(spec: mujoco.MjSpec, paths: Collection[Path], parts: Path) -> dict[P
     long = [mesh for mesh in spec.meshes if len(mesh.userface) > _SHORT and not len(mesh.usertexcoord)]
     if paths or long:
         parts.mkdir(exist_ok=True)
-    own = [path for path in paths if path.resolve().parent == parts.resolve()]  # the source's files are not overwritten
+    # files that the source names are not overwritten, nor written through a link
+    own = [file for file in parts.iterdir() if file.resolve() in paths] if parts.is_dir() else []
     for mesh in long:
         place = parts.resolve() / _unused(f"{mesh.name}.stl", [*new.values(), *own])
         write_stl(Triangles(np.reshape(mesh.uservert, (-1, 3)), np.reshape(mesh.userface, (-1, 3))), place)

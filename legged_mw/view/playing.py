@@ -368,7 +368,7 @@ def _stamp(path: Path) -> int:
 def watch_training(task: LoadedTask, runner: Runner, folder: Path) -> None:
     """Open the viewer of a starting run: a window, or without a screen a web page. It closes with the training."""
     if not checkpoints(folder):
-        first = f"model_{runner.current_learning_iteration}.pt"  # not 0 where another run is branched
+        first = f"model_{runner.current_learning_iteration}.pt"  # a branch of another run does not begin at 0
         try:
             runner.save(str(folder / first))  # the viewer's first policy
         except (OSError, MemoryError) as error:
