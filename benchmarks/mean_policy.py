@@ -13,6 +13,8 @@ from typing import Any
 
 import torch
 
+from legged_mw.rl.run_folder import load_tensors
+
 
 def between(before: dict[str, Any], after: dict[str, Any], share: float) -> dict[str, Any]:
     """Floating-point tensors are mixed; what else a model holds, such as counts, is ``after``'s."""
@@ -33,7 +35,7 @@ def main() -> None:
     parser.add_argument("share", type=float, help="0: before, 1: after")
     parser.add_argument("out", type=Path, help="the run's folder, which must not exist")
     args = parser.parse_args()
-    before, after = (torch.load(path, map_location="cpu", weights_only=True) for path in (args.before, args.after))
+    before, after = (load_tensors(path, "cpu") for path in (args.before, args.after))
     actor = between(before["actor_state_dict"], after["actor_state_dict"], args.share)
     args.out.mkdir(parents=True)
     kept = {name: after[name] for name in ("iter", "infos", "critic_state_dict")}

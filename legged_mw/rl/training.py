@@ -83,7 +83,13 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if not torch.cuda.is_available():
         torch.set_num_threads(1)  # a step has hundreds of small operations, which are slow on several threads
     start = _resume(task, args) if args.resume else None
+    began = _others(task)
     apply_overrides(task, args)
+    if start:
+        for path, before in began.items():
+            if before != (now := _others(task)[path]):
+                print(f"a resumed run keeps its {path}: '{before}', not '{now}'")
+                task.set(path, before)
     start = _find_others(task, start or Start(experiment_folder(task)))
     rank = this_rank()
     device = pick_device(rank_device(rank, args.device))
@@ -124,16 +130,17 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     return start
 
 
+def _others(task: LoadedTask) -> dict[str, str]:
+    """The config's teacher and warm start."""
+    return {
+        "distillation.teacher": task.train.distillation.teacher,
+        "warm_start.policy": task.train.warm_start.policy,
+    }
+
+
 def _find_others(task: LoadedTask, start: Start) -> Start:
     """Find the teacher and the warm start that the config names. A resumed run uses its copy of the teacher."""
     teacher, begin = task.train.distillation.teacher, task.train.warm_start.policy
-    if start.run:
-        config = load_yaml(start.run / CONFIG_FILE)
-        for section, field, now in (("distillation", "teacher", teacher), ("warm_start", "policy", begin)):
-            if now != (before := config.get(section, {}).get(field, "")):
-                print(f"a resumed run keeps its {section}.{field}: '{before}', not '{now}'")
-                task.update({section: {field: before}}, where=shown(start.run))
-        teacher, begin = task.train.distillation.teacher, task.train.warm_start.policy
     if teacher:
         teacher = str(start.run / TEACHER) if start.run else teacher
         start = start._replace(teacher=find_trained(teacher, start.experiment, "--teacher", task))
