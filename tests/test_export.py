@@ -185,6 +185,11 @@ def test_a_network_that_cannot_be_traced(made: Path, tmp_path: Path, monkeypatch
     assert not list(tmp_path.iterdir())
 
 
+def test_an_export_is_compared_under_full_kicks() -> None:
+    env = exporting._small_env(load_task("go2_flat"))  # whose kicks grow in training
+    assert env.cfg.perturbation.kick and env.perturbation.kick_level.eq(1.0).all()
+
+
 def test_a_nan_is_a_mismatch() -> None:
     actions = np.zeros((3, 2))
     with pytest.raises(ExportError, match="acts differently"):

@@ -214,11 +214,15 @@ def test_a_resumed_run_keeps_what_it_began_with(tuned: Path, tmp_path: Path) -> 
     shutil.copy(tuned / "model_1.pt", folder)
     before = load_yaml(folder / "config.yaml")
     more = ["--max_iterations", "2", "--set", "warm_start.policy=go1_flat", "--set", "distillation.teacher=go1_rough"]
+    more += ["--seed", "7", "--set", "algorithm.learning_rate=0.5"]
     result = run("train", tmp_path, "--device", "cpu", "--task", "go1_rough_student", "--resume", *more)
     assert result.code == 0, result.err
+    assert (
+        "keeps its seed: 1, not 7" in result.out and "keeps its algorithm.learning_rate: 0.001, not 0.5" in result.out
+    )
     assert "keeps its warm_start.policy: " in result.out and "keeps its distillation.teacher: '', not" in result.out
     after = load_yaml(folder / "config.yaml")
-    assert after["warm_start"] == before["warm_start"] and after["distillation"] == before["distillation"]
+    assert all(after[name] == before[name] for name in ("warm_start", "distillation", "seed", "algorithm"))
 
 
 def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: LeggedRobot) -> None:

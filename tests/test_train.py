@@ -33,8 +33,8 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export.network import save_onnx
 from legged_mw.rl.iteration_log import console_rows, curves
 from legged_mw.rl.learner_config import rsl_rl_config
-from legged_mw.rl.policies import act, find_policy, load_policy
-from legged_mw.rl.run_folder import checkpoints, find_checkpoint, find_run, new_run, runs
+from legged_mw.rl.policies import act, find_policy, find_trained, load_policy
+from legged_mw.rl.run_folder import checkpoints, find_checkpoint, find_run, new_run, runs, update_from_run
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
@@ -331,11 +331,20 @@ def test_the_newest_checkpoint_is_the_highest_number(tmp_path: Path) -> None:
         find_checkpoint(tmp_path, 3)
 
 
-def test_an_export_has_no_checkpoints() -> None:
-    task = load_task("go1_flat")
-    for name in ("shipped", str(ROOT / "resources/policies/go1_flat")):
+def test_an_export_has_no_checkpoints(tmp_path: Path) -> None:
+    task, shipped = load_task("go1_flat"), ROOT / "resources/policies/go1_flat"
+    for name in ("shipped", str(shipped)):
         with pytest.raises(ConfigError, match="--checkpoint 77: the .* has no checkpoints; name a run"):
             find_policy(task, name, 77)
+    with pytest.raises(ConfigError, match="--checkpoint 77: a file has no checkpoints; name a run"):
+        find_trained(str(shipped / "policy.onnx"), tmp_path, "exam", checkpoint=77)
+
+
+def test_checkpoints_beside_an_export_can_be_named(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "resources/policies/go1_flat", run := tmp_path / "run")
+    (run / "model_9.pt").touch()
+    assert find_policy(load_task("go1_flat"), str(run), 9).checkpoint.name == "model_9.pt"
+    assert find_policy(load_task("go1_flat"), str(run)).checkpoint.name == "policy.onnx"
 
 
 def test_runs_of_the_same_second_do_not_share_a_folder(tmp_path: Path) -> None:
@@ -611,3 +620,11 @@ def test_what_a_task_counts_is_shown_and_drawn() -> None:
         "Curriculum/my_figure": 7.0,
         "Curriculum/kick_level": 0.375,
     }
+
+
+def test_rewards_that_a_run_did_not_have_stay_off() -> None:
+    saved = load_task("go1_flat_fast").to_dict()
+    saved["rewards"]["scales"] = {"tracking_lin_vel": 3.0, "stand_still": 0.0}
+    update_from_run(task := load_task("go1_flat_fast"), saved, "config.yaml")
+    on = {name: scale for name, scale in task.to_dict()["rewards"]["scales"].items() if scale}
+    assert on == {"tracking_lin_vel": 3.0}

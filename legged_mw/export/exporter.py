@@ -146,8 +146,8 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
-    """A small environment of the trained task on a CPU, with kicks and pushes, without slopes, noise and delays."""
-    settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
+    """A small environment of the trained task on a CPU, with full kicks and pushes, without slopes, noise and delays."""
+    settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0, "perturbation.curriculum": False}
     settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay", "slope")}
     if hasattr(task.cfg, "motion"):
         settings["motion.clips"] = task.cfg.motion.clips[:1]  # a deployed robot follows only this clip

@@ -94,6 +94,7 @@ def find_trained(
     path, (task, _, run) = typed(name), name.partition("/")
     try:
         if path.is_file():
+            _refuse_checkpoint("a file", checkpoint)
             source = PolicySource(path.parent, path, shipped=False)
         elif task in task_names():
             source = find_policy(load_task(task), run or None, checkpoint)
@@ -123,7 +124,7 @@ def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> PolicyS
     """A run by its name or path, or an export by its path."""
     folder = typed(name)
     finish_moving(folder)  # of an export whose process was killed
-    if (folder / NETWORK_FILE).is_file():
+    if (folder / NETWORK_FILE).is_file() and (checkpoint == -1 or not checkpoints(folder)):
         _refuse_checkpoint(f"the export {name}", checkpoint)
         return PolicySource(check_folder(folder), folder / NETWORK_FILE, shipped=False)
     run = find_run(experiment, name)

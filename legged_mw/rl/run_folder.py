@@ -321,6 +321,7 @@ def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> l
 
     If the file lacks a learner's section, the run is older than the section. The section then gets the values of the
     base class, as the run had them, not those of the task. Returns the names of these sections.
+    A reward that the file lacks is newer than the run, too, and stays off.
     """
     saved = _with_new_names(saved)
     run_task = str(saved.get("task", task.name))
@@ -333,6 +334,8 @@ def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> l
     parents = [kind for kind in type(task.train).__mro__ if issubclass(kind, Config) and kind is not Config]
     defaults = parents[-1]().to_dict()
     newer = {name: value for name, value in defaults.items() if name not in saved and isinstance(value, dict)}
+    if isinstance(rewards := saved.get("rewards"), dict) and isinstance(scales := rewards.get("scales"), dict):
+        rewards["scales"] = dict.fromkeys(task.to_dict()["rewards"]["scales"], 0.0) | scales
     task.update({**saved, **newer}, where)
     return list(newer)
 

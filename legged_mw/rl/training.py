@@ -83,12 +83,12 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if not torch.cuda.is_available():
         torch.set_num_threads(1)  # a step has hundreds of small operations, which are slow on several threads
     start = _resume(task, args) if args.resume else None
-    began = _others(task)
+    began = _kept(task)
     apply_overrides(task, args)
     if start:
-        for path, before in began.items():
-            if before != (now := _others(task)[path]):
-                print(f"a resumed run keeps its {path}: '{before}', not '{now}'")
+        for path, now in _kept(task).items():
+            if now != (before := began.get(path, now)):
+                print(f"a resumed run keeps its {path}: {before!r}, not {now!r}")
                 task.set(path, before)
     start = _find_others(task, start or Start(experiment_folder(task)))
     rank = this_rank()
@@ -130,12 +130,17 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     return start
 
 
-def _others(task: LoadedTask) -> dict[str, str]:
-    """The config's teacher and warm start."""
-    return {
-        "distillation.teacher": task.train.distillation.teacher,
-        "warm_start.policy": task.train.warm_start.policy,
+def _kept(task: LoadedTask) -> dict[str, Any]:
+    """The values of the config that a checkpoint settles, so flags of a resume do not change them."""
+    train = task.train
+    kept = {
+        "distillation.teacher": train.distillation.teacher,
+        "warm_start.policy": train.warm_start.policy,
+        "seed": train.seed,
     }
+    if train.algorithm.schedule == "adaptive":
+        kept["algorithm.learning_rate"] = train.algorithm.learning_rate
+    return kept
 
 
 def _find_others(task: LoadedTask, start: Start) -> Start:
