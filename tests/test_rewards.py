@@ -163,8 +163,11 @@ def test_settings_reach_the_terms() -> None:
     assert term("dof_pos_limits") == pytest.approx([0.9 - 0.863, 0.0], abs=1e-6)  # the hard limits
     assert term("pose") == pytest.approx([math.exp(-2 * (0.64 + 0.25 + 1.0)), math.exp(-2 * (2.25 + 0.81))])
     assert term("stand_still") == pytest.approx([0.8 + 0.5 + 1.0, 2.4])
+    drift = math.hypot(0.27213, 0.106985)
+    assert term("stand_drift") == pytest.approx([math.hypot(1.13935, 3.371245), drift], abs=1e-6)
     assert term("feet_air_time") == term("feet_height") == term("feet_slip") == [0.0, 0.0]
     env.moving.fill_(True)
+    assert term("stand_drift") == [0.0, 0.0]
     assert term("feet_air_time") == pytest.approx([0.1 - 0.12] * 2)
     assert term("feet_height") == pytest.approx([0.0 + (0.08 / 0.12 - 1) ** 2, (0.07 / 0.12 - 1) ** 2])
     # |0.02 - 0.12| sqrt(5) + |0.06 - 0.12| + |0.15 - 0.12| * 0.5

@@ -529,6 +529,10 @@ class LeggedRobot(RobotTask):
         """Joints away from the default pose while the command is to stand [rad]. [L]"""
         return self.dof_offset.abs().sum(dim=1).masked_fill_(self.moving, 0.0)
 
+    def _reward_stand_drift(self) -> Tensor:
+        """Horizontal speed at the IMU while the command is to stand [m/s]. [ours]"""
+        return self.base_lin_vel[:, :2].norm(dim=1).masked_fill_(self.moving, 0.0)
+
     def _reward_feet_clearance(self) -> Tensor:
         """Feet that move fast away from the swing height [m^1.5/s^0.5]. [P]"""
         return ((self.foot_height - self.cfg.rewards.swing_height).abs() * self.foot_speed.sqrt()).sum(dim=1)
