@@ -141,6 +141,33 @@ class SimToRealRoughCfg(SimToRealCfg):
         velocity, curriculum_rate = [0.0, 8.0], 0.1  # [m/s], [-] [ours]
 
 
+class TrotRoughCfg(SimToRealRoughCfg):
+    """A quadruped of a Go2's size that trots on rough ground by a clock, on robots that differ.
+
+    Numbers without a source: [ours: docs/archive/go2_and_g1.md, stairs that are seen].
+    """
+
+    class gait(TrotCfg.gait):
+        pass
+
+    class terrain(SimToRealRoughCfg.terrain):
+        num_rows, difficulty = 12, [0.0, 1.2]  # stairs up to 22 cm
+
+    class rewards(SimToRealRoughCfg.rewards):
+        tracking_sigma_end = 0.1
+        swing_height = 0.16  # [m]
+
+        class scales(SimToRealRoughCfg.rewards.scales):
+            contact_phase = 0.3  # without the clock a Go2 with a height scan hops
+            feet_impact_vel = -0.15
+            target_limits = -1.0
+            stand_still = -1.5
+
+    class domain_rand(SimToRealRoughCfg.domain_rand):
+        friction, stiffness, damping = [0.3, 1.25], [0.85, 1.15], [0.85, 1.3]  # [-]
+        base_mass, delay_ms = [-1.0, 3.0], [0.0, 15.0]  # [kg] of a Go2, [ms]
+
+
 class SimToRealRoughCfgPPO(SimToRealCfgPPO):
     """The learner's config on rough ground: longer rollouts and a longer horizon."""
 
