@@ -158,14 +158,15 @@ class TrotRoughCfg(SimToRealRoughCfg):
         swing_height = 0.16  # [m]
 
         class scales(SimToRealRoughCfg.rewards.scales):
-            contact_phase = 0.3  # without the clock a Go2 with a height scan hops
+            contact_phase = 0.3  # for the clock's pace
             feet_impact_vel = -0.15
             target_limits = -1.0
             stand_still = -1.5
 
     class domain_rand(SimToRealRoughCfg.domain_rand):
         friction, stiffness, damping = [0.3, 1.25], [0.85, 1.15], [0.85, 1.3]  # [-]
-        base_mass, delay_ms = [-1.0, 3.0], [0.0, 15.0]  # [kg] of a Go2, [ms]
+        base_mass = [-1.0, 3.0]  # [kg] of a robot of a Go2's size
+        delay_ms = [0.0, 15.0]  # [ms]
 
 
 class SimToRealRoughCfgPPO(SimToRealCfgPPO):

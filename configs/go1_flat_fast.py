@@ -30,7 +30,7 @@ class Go1FlatFastCfg(Go1FlatCfg):
 
 class Go1FlatFastCfgPPO(Go1FlatCfgPPO):
     class runner(Go1FlatCfgPPO.runner):
-        max_iterations = 1040  # 136 M steps
+        max_iterations = 930  # 122 M steps
         save_interval = 60
         matmul_precision = "bf16"
 

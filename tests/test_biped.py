@@ -59,7 +59,15 @@ def touch(env: LeggedRobot, *feet: tuple[float, float]) -> None:
 
 def test_every_term_has_a_figure() -> None:
     methods = {name.removeprefix("_reward_") for name in dir(LeggedRobot) if name.startswith("_reward_")}
-    assert methods == {*test_rewards.EXPECTED, "target_limits", "motor_heat", *TERMS, *FEET, *test_forces.SCALES}
+    assert methods == {
+        *test_rewards.EXPECTED,
+        "stand_drift",
+        "target_limits",
+        "motor_heat",
+        *TERMS,
+        *FEET,
+        *test_forces.SCALES,
+    }
 
 
 # ---- base and joints
