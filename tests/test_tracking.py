@@ -17,8 +17,7 @@ from legged_mw.eval.perform import machine, prepare
 from legged_mw.eval.skills import PUSH_EVERY, ExamGround, Recording, TrackingExam
 from legged_mw.export.exporter import export
 from legged_mw.skills.clip import Clip, read_clip, save_clip
-from legged_mw.skills.motion_reference import angle_between
-from legged_mw.skills.motion_tracking import MotionTracking, quat_multiply, rotation_quat
+from legged_mw.skills.motion_tracking import MotionTracking, angle_between, quat_multiply, rotation_quat
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.task import load_task
 
