@@ -302,7 +302,6 @@ _DISTRIBUTIONS = (
     "rsl_rl.modules.distribution:GaussianDistribution",
     "rsl_rl.modules.distribution:HeteroscedasticGaussianDistribution",
 )
-_BETA = "rsl_rl.modules.distribution:BetaDistribution"
 ALLOWED: dict[str, tuple[str, ...]] = {
     "actor.class_name": _NETWORKS,
     "critic.class_name": _NETWORKS,
@@ -330,8 +329,6 @@ def check_classes(cfg: Config) -> None:
     rsl-rl imports and calls the value of ``class_name``. A run folder may come from a stranger, so its config.yaml must
     not choose code.
     """
-    for network in ("actor", "critic"):
-        _check_distribution(cfg.to_dict().get(network, {}).get("distribution_cfg"), f"{network}.distribution_cfg")
     own = dict(_class_names(type(cfg)().to_dict()))
     for path, name in _class_names(cfg.to_dict()):
         if path in own and name == own[path]:
@@ -380,23 +377,6 @@ def network_section(section: dict[str, Any]) -> dict[str, Any]:
         section = {**section, "class_name": _RECURRENT}
     taken = inspect.signature(resolve_class(section)[0]).parameters
     return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
-
-
-def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
-    """Raise ConfigError if a section has fields that its distribution of rsl-rl does not take."""
-    name = (section or {}).get("class_name")
-    for kind in (*_DISTRIBUTIONS, _BETA):
-        if section is None or name not in spellings(kind):
-            continue
-        from rsl_rl.utils import resolve_callable
-
-        surplus = sorted(section.keys() - inspect.signature(resolve_callable(kind)).parameters.keys() - {"class_name"})
-        if surplus:
-            fit = ", ".join(other.partition(":")[2] for other in _DISTRIBUTIONS)
-            raise ConfigError(
-                f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; "
-                f"there fit: {fit}"
-            )
 
 
 def spellings(kind: str) -> list[str]:
