@@ -14,8 +14,10 @@ import pytest
 from program import run
 
 from legged_mw import ROOT
-from legged_mw.drawing.scene import ground_model, visual_model, visual_spec
-from legged_mw.drawing.terrain_look import _slopes, relief
+from legged_mw.drawing import terrain_look
+from legged_mw.drawing.scene import add_scene, visual_model, visual_spec
+from legged_mw.drawing.terrain_look import _slopes, add_relief, relief
+from legged_mw.sim.ground import GROUND, Ground, add_ground
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.task import load_task
 from legged_mw.view.camera import ELEVATION, RobotCamera
@@ -72,9 +74,25 @@ def shown(model: mujoco.MjModel) -> set[int]:
     return set(np.flatnonzero(fields & (model.geom_rgba[:, 3] > 0)).tolist())
 
 
+def drawn(ground: Terrain) -> mujoco.MjModel:
+    """The ground alone."""
+    spec = mujoco.MjSpec()
+    add_ground(spec, Ground(terrain=ground), [])
+    add_scene(spec)
+    add_relief(spec, ground, GROUND)
+    return spec.compile()
+
+
+@pytest.fixture
+def without_squares(monkeypatch: pytest.MonkeyPatch) -> None:
+    for squares in ("CHECKER", "LINE"):
+        monkeypatch.setattr(terrain_look, squares, 0.0)
+
+
+@pytest.mark.usefixtures("without_squares")
 def test_edges_are_light_and_risers_dark() -> None:
     ground = terrain("stairs_down", levels=1, cell=0.05)
-    tone = relief(ground, squares=False)[..., 1].astype(int)
+    tone = relief(ground)[..., 1].astype(int)
     along = tone[tone.shape[0] // 2, tone.shape[1] // 2 :]  # from the middle of the top, outwards
     heights = ground.heights[ground.heights.shape[0] // 2, ground.heights.shape[1] // 2 :]
     edge = int(np.flatnonzero(np.diff(heights))[0])  # the cell of the first riser
@@ -99,9 +117,10 @@ def test_squares_of_half_a_metre_and_lines_around_tiles() -> None:
     assert at(0.25, 0.25) < at(1.0, 0.25) < at(0.0, 0.25), "a line at a metre, a lighter one where the two tiles meet"
 
 
+@pytest.mark.usefixtures("without_squares")
 def test_the_picture_lies_where_the_heights_are() -> None:
     ground = terrain("obstacles", "obstacles", levels=2, seed=3)
-    model = ground_model(ground)
+    model = drawn(ground)
     (
         model.light_active[:],
         model.vis.headlight.diffuse[:],
@@ -117,7 +136,7 @@ def test_the_picture_lies_where_the_heights_are() -> None:
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
         seen = renderer.render()[::-1, :, 1].astype(float)  # row = +y
     edge = round(2.0 / 0.1)
-    asked = relief(ground, squares=False)[edge:-edge, edge:-edge, 1].astype(float)  # 160 x 160: a pixel each
+    asked = relief(ground)[edge:-edge, edge:-edge, 1].astype(float)  # 160 x 160: a pixel each
     assert asked.shape == seen.shape
     match = np.corrcoef(seen.ravel(), asked.ravel())[0, 1]
     others = [np.corrcoef(seen.ravel(), other.ravel())[0, 1] for other in (asked[::-1], asked[:, ::-1], asked.T)]
@@ -142,7 +161,7 @@ def test_flat_ground_lies_all_around_as_far_as_a_camera_sees(levels: int, column
     ground = make_terrain(
         levels=levels, proportions={"flat": 1.0}, columns=columns, tile=8.0, cell=1.0, border=2.0, seed=1
     )
-    model = ground_model(ground)
+    model = drawn(ground)
     pieces = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, 0] > 0)
     x, y = 4.0 * levels, 4.0 * columns
     grid = np.stack(

@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 
 from legged_mw.drawing.terrain_look import add_relief, add_squares
-from legged_mw.sim.ground import GROUND, Ground, add_ground
+from legged_mw.sim.ground import GROUND
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.terrain import Terrain
 
 GROUND_MATERIAL = "ground"  # name of the floor's material
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
@@ -52,15 +51,6 @@ def reach(robot: RobotModel) -> float:
     geoms = model.geom_bodyid > 0
     shapes = np.linalg.norm(data.geom_xpos[geoms], axis=1) + model.geom_rbound[geoms]
     return float(max(*np.linalg.norm(data.xpos[1:], axis=1), *shapes, 0.1))
-
-
-def ground_model(terrain: Terrain) -> mujoco.MjModel:
-    """A model of the ground alone, for views from a distance."""
-    spec = mujoco.MjSpec()
-    add_ground(spec, Ground(terrain=terrain), [])
-    add_scene(spec)
-    add_relief(spec, terrain, GROUND, squares=False)
-    return spec.compile()
 
 
 def add_scene(spec: mujoco.MjSpec) -> None:

@@ -35,13 +35,13 @@ HILL, HILL_HEIGHT = 0.12, 0.5  # hills are lighter and pits darker: largest shar
 REACH = 200.0  # [m] flat ground beyond the tiles; a camera sees 150 m
 
 
-def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool = True) -> None:
+def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str) -> None:
     """Replace the geom ``ground`` in a ``spec`` with a scene by textured tiles of ``terrain``.
 
-    ``squares``: draw checker squares as a scale for speed. Each tile has a fine and a hidden coarse height field.
-    A slow renderer shows the coarse one for distant tiles (view/posed_robot.py).
+    Each tile has a fine and a hidden coarse height field. A slow renderer shows the coarse one for distant tiles
+    (view/posed_robot.py).
     """
-    floor, picture = spec.geom(ground), relief(terrain, squares)
+    floor, picture = spec.geom(ground), relief(terrain)
     spec.delete(spec.hfield(floor.hfieldname))
     for level, column in np.ndindex(terrain.levels, len(terrain.kinds)):
         _add_tile(spec, terrain, level, column, picture)
@@ -49,7 +49,7 @@ def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool
         if light.name == "key":
             light.dir, light.diffuse = STEEP_LIGHT, [0.75, 0.74, 0.71]
     spec.visual.headlight.diffuse = [0.15, 0.15, 0.15]
-    _add_surroundings(spec, terrain, squares)
+    _add_surroundings(spec, terrain)
     # MuJoCo draws haze only for an infinite plane. This plane is invisible, because it would fill the pits.
     floor.type, floor.size, floor.pos, floor.hfieldname = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, 0.05], [0, 0, 0], ""
     floor.material, floor.rgba, floor.castshadow = "", [0, 0, 0, 0.001], False
@@ -84,18 +84,18 @@ def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, level: int, column: int, pi
             geom.rgba = [*geom.rgba[:3], 0.0]
 
 
-def relief(terrain: Terrain, squares: bool = True) -> Picture:
+def relief(terrain: Terrain) -> Picture:
     """A picture of the ground from above: one pixel per cell, rows along +y, columns along +x."""
     heights = terrain.heights.astype(np.float32)
     above = heights - _blurred(heights, max(round(0.5 * EDGE_WIDTH / terrain.cell), 1))
     tone = 1.0 + np.clip(EDGE * above, -EDGE_MAX, EDGE_MAX) + HILL * np.tanh(heights / HILL_HEIGHT)
     steep = np.clip((_slopes(heights) / terrain.cell - STEEP_FROM) / (STEEP_TO - STEEP_FROM), 0.0, 1.0)
     cells = 0.25 * (tone[1:, 1:] + tone[1:, :-1] + tone[:-1, 1:] + tone[:-1, :-1])
-    picture = cells * (1.0 - STEEP * steep) * (1.0 + _lines(terrain, squares))
+    picture = cells * (1.0 - STEEP * steep) * (1.0 + _lines(terrain))
     return (np.minimum(picture[..., None] * COLOUR, 1.0) * 255).astype(np.uint8)
 
 
-def _lines(terrain: Terrain, squares: bool) -> Tones:
+def _lines(terrain: Terrain) -> Tones:
     """The brightness of squares and lines at the centres of pixels."""
     at_square, at_metre, at_tile = [], [], []  # one array along x, one along y
     first = (along.start * terrain.cell for along in terrain.vertices(0, 0)[::-1])
@@ -106,7 +106,7 @@ def _lines(terrain: Terrain, squares: bool) -> Tones:
             share = (place - origin) / every
             on.append(np.abs(share - np.round(share)) * every < 0.51 * terrain.cell)
     (dark_x, dark_y), (metre_x, metre_y), (tile_x, tile_y) = at_square, at_metre, at_tile
-    lines = np.where(metre_x | metre_y[:, None], LINE, CHECKER * (2 * (dark_x ^ dark_y[:, None]) - 1)) * squares
+    lines = np.where(metre_x | metre_y[:, None], LINE, CHECKER * (2 * (dark_x ^ dark_y[:, None]) - 1))
     return np.where(tile_x | tile_y[:, None], TILE_LINE, lines).astype(np.float32)
 
 
@@ -142,9 +142,9 @@ def add_material(spec: mujoco.MjSpec, name: str, **mapping: Any) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
-def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> None:
+def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain) -> None:
     """Add the flat ground around the tiles, up to the limit of sight."""
-    add_squares(spec, AROUND, *(COLOUR * (1 + share * squares) for share in (-CHECKER, CHECKER, LINE)))
+    add_squares(spec, AROUND, *(COLOUR * (1 + share) for share in (-CHECKER, CHECKER, LINE)))
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "contype": 0, "conaffinity": 0, "castshadow": False}
     x, y = 0.5 * terrain.levels * terrain.tile, 0.5 * len(terrain.kinds) * terrain.tile
     reach = max(REACH, 2 * x, 2 * y)  # a picture of all tiles sees up to their length
