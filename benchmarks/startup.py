@@ -1,23 +1,18 @@
 """Where the time goes from the command to the first iterations: python benchmarks/startup.py --task go1_flat
 
 A fresh process runs train.py, and each of its parts is timed; other flags are train.py's. Warm: the second of two runs, when kernels
-and files are cached. --plain leaves out what legged_mw/fast/quick_start.py does; --profile shows which functions the first iteration
-spends its time in, and which large packages were imported until then, and from where.
+and files are cached. --plain leaves out what legged_mw/fast/quick_start.py does.
 """
 
 from __future__ import annotations
 
 import argparse
-import cProfile
 import os
-import pstats
 import re
 import subprocess
 import sys
 import tempfile
 import time
-import traceback
-from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -26,10 +21,6 @@ from typing import Any
 ITERATIONS = 5
 FIRST = "iteration 1 (records the step)"
 ROOT = Path(__file__).resolve().parent.parent
-
-
-PART = "- "  # begins the name of a part of the first iteration
-LARGE = 25  # modules of a package that --profile names
 
 
 class Clock:
@@ -43,84 +34,50 @@ class Clock:
         print(f"{now - self._last:.3f} {modules - self._modules} {what}", flush=True)
         self._last, self._modules = now, modules
 
-    def after(self, owner: Any, name: str, *what: str) -> None:
-        """Time to the end of a function, which goes by ``name`` in a module or class; of its first, second call ..."""
-        call, left = getattr(owner, name), list(what)
+    def after(self, owner: Any, name: str, what: str) -> None:
+        """Time to the end of the first call of a function, which goes by ``name`` in a module or class."""
+        call, left = getattr(owner, name), [what]
 
         def timed(*args: Any, **kwargs: Any) -> Any:
             value = call(*args, **kwargs)
             if left:
                 synchronize()
-                self.done(left.pop(0))
+                self.done(left.pop())
             return value
 
         setattr(owner, name, timed)
 
 
-class Importers:
-    """A finder that finds nothing, and notes who asked for the first module of each package."""
-
-    def __init__(self) -> None:
-        self._by: dict[str, str] = {}
-
-    def find_spec(self, name: str, path: object, target: object = None) -> None:
-        package = package_of(name)
-        if package not in self._by:
-            calls = [
-                f"{Path(f.filename).parent.name}/{Path(f.filename).name}:{f.lineno}"
-                for f in traceback.extract_stack()[:-1]
-            ]
-            self._by[package] = " < ".join([call for call in reversed(calls) if "importlib" not in call][:4])
-
-    def show(self) -> None:
-        """The large packages among all that is imported by now."""
-        count = Counter(package_of(name) for name in sys.modules)
-        for package, modules in count.most_common():
-            if modules >= LARGE:
-                print(f"{modules:>6} modules of {package:<28} {self._by.get(package, 'before')}", flush=True)
-
-
-def package_of(name: str) -> str:
-    """The package that a module counts for; each of torch's own counts alone."""
-    return ".".join(name.split(".")[: 2 if name.startswith("torch.") else 1])
-
-
-def child(flags: list[str], device: str | None, plain: bool, profile: bool, started: float) -> None:
+def child(flags: list[str], device: str | None, plain: bool, started: float) -> None:
     """train.py until a few iterations are done; its imports come one by one, in its own order."""
-    clock, importers = Clock(started), Importers()
-    if profile:
-        sys.meta_path.insert(0, importers)  # type: ignore[arg-type]
+    clock = Clock(started)
     from legged_mw import programs
     from legged_mw.fast import quick_start
 
     clock.done("interpreter, flags")
     if not plain:
         quick_start.begin(device)
-    gpu = import_libraries(clock, device)
+    import_libraries(clock, device)
     runner = look_into_training(clock)
-    if gpu:
-        look_into_steps(clock)
-    runner._update = count(clock, runner._update, profile_learning(runner, importers) if profile else lambda: None)
+    runner._update = count(clock, runner._update)
     sys.argv = ["train.py", *flags]
     programs.train()
 
 
-def import_libraries(clock: Clock, device: str | None) -> bool:
-    """Time what train.py imports of others. Returns whether it is for a GPU."""
+def import_libraries(clock: Clock, device: str | None) -> None:
+    """Time what train.py imports of others."""
     import torch
 
     clock.done("import torch")
     import_module("mujoco")
     clock.done("import mujoco")
-    gpu = torch.cuda.is_available() and device != "cpu"
-    if gpu:  # elsewhere MuJoCo's own engine steps
+    if torch.cuda.is_available() and device != "cpu":  # elsewhere MuJoCo's own engine steps
         import_module("warp")
         clock.done("import warp (for a GPU)")
         import_module("mujoco_warp")
         clock.done("import mujoco_warp (for a GPU)")
     import_module("rsl_rl.runners")
     clock.done("import rsl_rl, tensordict")
-    return gpu
 
 
 def look_into_training(clock: Clock) -> Any:
@@ -141,34 +98,8 @@ def look_into_training(clock: Clock) -> Any:
     return runner
 
 
-def profile_learning(runner: Any, importers: Importers) -> Callable[[], None]:
-    """Profile ``runner.learn`` until the function that this returns is called, which shows what was found."""
-    learn, profiler = runner.learn, cProfile.Profile()
-    runner.learn = lambda *args, **kwargs: profiler.runcall(learn, *args, **kwargs)
-
-    def show() -> None:
-        profiler.disable()
-        for order in ("cumulative", "tottime"):
-            pstats.Stats(profiler).sort_stats(order).print_stats(60)
-        importers.show()
-
-    return show
-
-
-def look_into_steps(clock: Clock) -> None:
-    """Time the first steps on a GPU: three run eagerly, the third is fused, the fourth is recorded."""
-    graph = import_module("legged_mw.sim.graph")
-    fused, fusion = (import_module(f"legged_mw.fast.{name}") for name in ("fused", "fusion"))
-    clock.after(fusion.Trace, "__exit__", PART + "two steps; a third, traced")
-    clock.after(fused.Fused, "__init__", PART + "write the fused step's kernels")
-    clock.after(fused.Fused, "compile", PART + "compile what is not cached")
-    clock.after(fused.Fused, "verify", PART + "hold its parts against the original's")
-    clock.after(fusion, "fused", PART + "hold it against the original step")
-    clock.after(graph.StepGraph, "_record", PART + "record it")
-
-
-def count(clock: Clock, update: Callable[..., Any], first: Callable[[], None]) -> Callable[..., Any]:
-    """The update, with which an iteration is done; ``first`` is called after the first; the process ends with the last."""
+def count(clock: Clock, update: Callable[..., Any]) -> Callable[..., Any]:
+    """The update, with which an iteration is done; the process ends with the last."""
     done = 0
 
     def counted(*args: Any) -> Any:
@@ -177,8 +108,6 @@ def count(clock: Clock, update: Callable[..., Any], first: Callable[[], None]) -
         synchronize()
         done += 1
         clock.done(FIRST if done == 1 else f"iteration {done}{' (records the update)' if done == 4 else ''}")
-        if done == 1:
-            first()
         if done == ITERATIONS:
             os._exit(0)
         return value
@@ -197,17 +126,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--plain", action="store_true")
-    parser.add_argument("--profile", action="store_true")
     parser.add_argument("--started", type=float, help=argparse.SUPPRESS)
     args, flags = parser.parse_known_args()
     flags += ["--device", args.device] if args.device else []
     flags += [] if "--task" in flags else ["--task", "go1_flat"]
     sys.path.insert(0, str(ROOT))
     if args.started:
-        child(flags, args.device, args.plain, args.profile, args.started)
+        child(flags, args.device, args.plain, args.started)
         return
     table: dict[str, list[float]] = {}
-    modules, others = dict[str, int](), list[str]()
+    modules = dict[str, int]()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     for _ in range(2):
         command = [sys.executable, __file__, *sys.argv[1:], "--started", str(time.time())]
@@ -215,22 +143,14 @@ def main() -> None:
             out = subprocess.run(
                 command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True
             ).stdout
-        others.clear()
         for line in out.splitlines():
             if found := re.fullmatch(r"(\d+\.\d{3}) (\d+) (.+)", line):
                 table.setdefault(found[3], []).append(float(found[1]))
                 modules[found[3]] = int(found[2])
-            else:
-                others.append(line)
-    parts = [what for what in table if what.startswith(PART)]
-    table[FIRST] = [sum(each) for each in zip(*(table[what] for what in (*parts, FIRST)), strict=True)]
-    modules[FIRST] += sum(modules[what] for what in parts)
-    if args.profile:
-        print("\n".join(others))
     print(f"{'':<48}{'first':>8}{'warm':>8}   [s]  modules")
     for what, values in table.items():
         print(f"{what:<48}" + "".join(f"{value:>8.2f}" for value in values) + f"{modules[what]:>14}")
-    until_first = [what for what in list(table)[: list(table).index(FIRST) + 1] if what not in parts]
+    until_first = list(table)[: list(table).index(FIRST) + 1]
     total = "".join(f"{sum(table[what][i] for what in until_first):>8.2f}" for i in (0, 1))
     print(f"{'from the command to the end of iteration 1':<48}{total}{sum(modules[what] for what in until_first):>14}")
 
