@@ -168,9 +168,9 @@ def test_pull_lifts_and_fades() -> None:
 # ---- what an exam makes of a recording
 
 
-def recording(robot: ExamRobot, seconds: float, count: int) -> Recording:
+def recording(robot: ExamRobot, steps: int, count: int) -> Recording:
     """Robots that stand."""
-    steps, joints = round(seconds / robot.dt), robot.model.nv - 6
+    joints = robot.model.nv - 6
     qpos = np.tile(robot.home, (steps, count, 1))
     return Recording(
         qpos, np.zeros((steps, count, 6 + joints)), np.zeros((steps, count, joints)), np.full(count, np.inf)
@@ -180,7 +180,7 @@ def recording(robot: ExamRobot, seconds: float, count: int) -> Recording:
 def test_what_getup_judges(robot: ExamRobot) -> None:
     """Up at once; up after 2 s; too late; down again after 3 s; never; up, but an episode ended."""
     skill = skills.GetupExam(within=3.0)
-    seen = recording(robot, skill.seconds, 6)
+    seen = recording(robot, skill.steps(robot), 6)
     at = {seconds: round(seconds / robot.dt) for seconds in (2.0, 3.0, 3.1)}
     seen.qpos[: at[2.0], 1, 2] = 0.1
     seen.qpos[: at[3.1], 2, 3:7] = UPSIDE_DOWN
@@ -207,7 +207,7 @@ def test_upright_is_by_gravity() -> None:
     assert env.robot.physics.geom("floor").friction[0] == 0.4
     expected = torch.tensor([math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))])
     torch.testing.assert_close(env.gravity_dir[0], expected, atol=1e-6, rtol=0.0)
-    seen = recording(machine(env), 1.0, 2)
+    seen = recording(machine(env), 50, 2)
     lean = math.radians(25.0) / 2
     seen.qpos[:, 1, 3:7] = [math.cos(lean), 0.0, math.sin(lean), 0.0]  # nose down, downhill: 35 degrees
     assert skills.standing(machine(env), seen).mean(axis=0).tolist() == [1.0, 0.0]
@@ -222,7 +222,7 @@ def test_handstand_rewards_and_judge() -> None:
     torch.testing.assert_close(env._reward_stand_attitude(), torch.tensor([0.25, 1.0, 0.0]), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(env._reward_stand_height(), torch.tensor([math.exp(0.278 - 0.55), 1.0, 1.0]))
     skill, here = skills.HandstandExam(nose=-1.0, height=0.55, hands=["FR", "FL"]), machine(env)
-    seen = recording(here, skill.seconds, 4)
+    seen = recording(here, skill.steps(here), 4)
     seen.qpos[:, :3, 2], seen.qpos[:, :3, 3:7] = 0.6, NOSE_DOWN
     seen.qpos[round(4.0 / here.dt), 1, 3:7] = [1.0, 0.0, 0.0, 0.0]  # at 4 s: 4 s before, 4 s after
     seen.qpos[:, 2, 2] = 0.2  # low: its head is in the ground

@@ -103,14 +103,9 @@ class Skill(ABC):
     measures: ClassVar[Sequence[Measure]]
     overrides: ClassVar[Mapping[str, Any]] = {}  # config fields, in addition to rollout.OVERRIDES
 
-    @property
     @abstractmethod
-    def seconds(self) -> float:
-        """Duration of a recording [s]."""
-
     def steps(self, robot: ExamRobot) -> int:
         """Duration of a recording [control steps]."""
-        return round(self.seconds / robot.dt)
 
     @abstractmethod
     def starts(self, robot: ExamRobot, count: int) -> Starts | None:
@@ -199,18 +194,16 @@ class GetupExam(Skill):
     )
     overrides: ClassVar = {"falls.pull": 0.0, "falls.states": 1}  # the falls come from `starts`
 
-    @property
-    def seconds(self) -> float:
-        return self.within + GETUP_STAY + GETUP_HOLD
+    def steps(self, robot: ExamRobot) -> int:
+        return round((self.within + GETUP_STAY + GETUP_HOLD) / robot.dt)
 
     def starts(self, robot: ExamRobot, count: int) -> tuple[Floats, Floats]:
         return fallen(robot.model, count, GETUP_SEED, GETUP_SETTLING)
 
     def judge(self, robot: ExamRobot, recording: Recording) -> dict[str, float | None]:
         hold, stay, limit = (round(seconds / robot.dt) for seconds in (GETUP_HOLD, GETUP_STAY, self.within))
-        held = _lasting(
-            standing(robot, recording), hold
-        )  # (T - hold + 1, N) true if it stands for GETUP_HOLD from this step
+        # (T - hold + 1, N) true if it stands for GETUP_HOLD from this step
+        held = _lasting(standing(robot, recording), hold)
         # (N,) first such step; len(held) if there is none
         up_at = np.where(held.any(axis=0), held.argmax(axis=0), len(held))
         up = up_at <= limit
@@ -248,10 +241,8 @@ def _lasting(true: np.ndarray, steps: int) -> np.ndarray:
 # ---- handstand: rise from a stand on four legs to a handstand or footstand and hold it for 5 s
 
 
-HANDSTAND_SEED, HANDSTAND_OFFSET = (
-    30_000,
-    0.05,
-)  # seed; each joint angle at the start has an offset U(-HANDSTAND_OFFSET, HANDSTAND_OFFSET) [rad] [ours]
+# Seed; each joint angle at the start has an offset U(-HANDSTAND_OFFSET, HANDSTAND_OFFSET) [rad] [ours].
+HANDSTAND_SEED, HANDSTAND_OFFSET = 30_000, 0.05
 HANDSTAND_WITHIN, HANDSTAND_HOLD = 3.0, 5.0  # [s] time limit for rising, time to hold [ours]
 # Handstand: largest angle between the root's x axis and the vertical [deg], smallest share of the height [ours].
 HANDSTAND_TILT, HANDSTAND_HIGH = 30.0, 0.8
@@ -277,9 +268,8 @@ class HandstandExam(Skill):
         Measure("power", "power while up, mean [W]", 0),
     )
 
-    @property
-    def seconds(self) -> float:
-        return HANDSTAND_WITHIN + HANDSTAND_HOLD
+    def steps(self, robot: ExamRobot) -> int:
+        return round((HANDSTAND_WITHIN + HANDSTAND_HOLD) / robot.dt)
 
     def starts(self, robot: ExamRobot, count: int) -> tuple[Floats, Floats]:
         qpos = np.tile(robot.home, (count, 1))
@@ -355,10 +345,6 @@ class TrackingExam(Skill):
         "motion.hold_s": 1.0,  # an episode that ends with the clip would end before its last frame is judged
         **{f"termination.{name}": FAR for name in ("max_anchor_height", "max_anchor_tilt", "max_end_height")},
     }
-
-    @property
-    def seconds(self) -> float:
-        return 0.0  # the clip sets the duration; see `steps`
 
     def steps(self, robot: ExamRobot) -> int:
         assert robot.motion
