@@ -26,7 +26,7 @@ from legged_mw.export.network import run_onnx
 from legged_mw.rl.policies import act, attach_teacher_observations, begin_with, find_trained, load_policy, load_teacher
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, pick_teacher_worlds
+from legged_mw.rl.students.concurrent import ConcurrentModel, pick_teacher_worlds
 from legged_mw.utils.task import LoadedTask
 
 TAUGHT = {
@@ -287,7 +287,7 @@ def test_the_newest_frames_of_rows_within_a_group_of_groups() -> None:
     """The critic's group begins with the actor's, three frames of each row, and shows one of its own rows."""
     task = task_with(**{"obs_groups.actor": ["privileged_state"], "actor.concurrent.groups": ["privileged_state"]})
     env = LeggedRobot(task.cfg, "cpu")
-    newest = concurrent_settings(task.train.to_dict(), env, learns=False)["newest"]
+    newest = ConcurrentModel.settings(task.train.to_dict(), env, learns=False)["concurrent"]["newest"]
     assert newest[:6] == [(6, 9), (15, 18), (42, 54), (78, 90), (114, 126), (132, 135)]
     assert newest[-1][1] == env.observations.buffers["privileged_state"].shape[1]
     assert sum(stop - start for start, stop in newest) == newest[-1][1] - 2 * 45

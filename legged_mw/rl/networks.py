@@ -244,7 +244,10 @@ class RegressingModel(MLPModel):
 
     @staticmethod
     def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-        """Additional constructor arguments, see ``actor_settings``. Raises ConfigError."""
+        """Additional constructor arguments for the learner's ``sections``. Raises ConfigError.
+
+        ``learns``: False for an actor that only acts; ``env`` may then lack rows that only learning needs.
+        """
         raise NotImplementedError
 
     def rollout_latent(self, obs: TensorDict) -> Tensor:

@@ -109,7 +109,22 @@ class ConcurrentModel(RegressingModel):
 
     @staticmethod
     def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-        return {"concurrent": concurrent_settings(sections, env, learns)}
+        concurrent, read = sections["actor"]["concurrent"], sections["obs_groups"]["actor"]
+        groups = concurrent["groups"] if learns else []
+        for group in groups:
+            if group not in env.observations.groups:
+                raise ConfigError(
+                    f"{FIELD}: {unknown('observation group', group, env.observations.groups, 'the observation table')}"
+                )
+            if group in read:
+                raise ConfigError(
+                    f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure"
+                )
+        newest, stop = [], 0
+        for row in (row for group in read for row in env.observations.rows(group)):
+            stop += row.size
+            newest.append((stop - row.value.shape[1], stop))
+        return {"concurrent": {**concurrent, "newest": newest, "groups": groups}}
 
 
 class _OnnxStudent(nn.Module):
@@ -142,26 +157,3 @@ def unit(x: Tensor) -> Tensor:
 def pick_teacher_worlds(worlds: int, share: float) -> Tensor:
     """(N, 1) True for worlds that act with the teacher's latent, equal in each run. Neighbours include both kinds."""
     return ((torch.arange(worlds, dtype=torch.float64) * _GOLDEN) % 1.0 < share)[:, None]
-
-
-def concurrent_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-    """Section ``actor.concurrent`` of the learner's ``sections`` in the form of ConcurrentModel. Raises ConfigError.
-
-    ``learns``: False for a student that only acts and needs no teacher.
-    """
-    concurrent, read = sections["actor"]["concurrent"], sections["obs_groups"]["actor"]
-    groups = concurrent["groups"] if learns else []
-    for group in groups:
-        if group not in env.observations.groups:
-            raise ConfigError(
-                f"{FIELD}: {unknown('observation group', group, env.observations.groups, 'the observation table')}"
-            )
-        if group in read:
-            raise ConfigError(
-                f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure"
-            )
-    newest, stop = [], 0
-    for row in (row for group in read for row in env.observations.rows(group)):
-        stop += row.size
-        newest.append((stop - row.value.shape[1], stop))
-    return {**concurrent, "newest": newest, "groups": groups}

@@ -116,7 +116,8 @@ class EstimatingModel(RegressingModel):
 
     @staticmethod
     def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-        return {"estimator": estimator_settings(sections, env, learns)}
+        targets = [tuple(target) for target, _ in find_targets(sections, env, learns)]
+        return {"estimator": {**sections["actor"]["estimator"], "targets": targets}}
 
 
 def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
@@ -146,17 +147,6 @@ class _OnnxEstimatingModel(nn.Module):
 
 
 # ---- the config section ---------------------------------------------------------------------------------------------
-
-
-def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
-    """Section ``actor.estimator`` of the learner's ``sections`` in the form of EstimatingModel. Raises ConfigError.
-
-    ``learns``: False for an actor that only acts, in worlds that may lack rows of ``domain_rand`` for the critic.
-    """
-    return {
-        **sections["actor"]["estimator"],
-        "targets": [tuple(target) for target, _ in find_targets(sections, env, learns)],
-    }
 
 
 def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:
