@@ -47,7 +47,7 @@ def both() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         env = task.env_class(task.cfg, "cpu")
         policy = load_policy(SHIPPED / "policy.onnx", env, task.train, "cpu")
         plain = rollout.run_exam(env, lambda obs: act(policy, obs))
-        rollout.prepare_report(task)
+        rollout.make_room(task)
         return plain, *rollout.examine(task.env_class(task.cfg, "cpu"), lambda obs: act(policy, obs))
 
 
@@ -162,7 +162,7 @@ def pages(both: tuple[dict[str, Any], ...], tmp_path_factory: pytest.TempPathFac
     for key in ("speed", "power", "cost_of_transport"):
         nothing["transport"][key] = [None] * len(nothing["transport"]["vx"])
     for shown in nothing["joints"].values():
-        shown |= {"edges": [], "density": [], "quantiles": [], "saturated": []}
+        shown |= {"edges": [], "density": [], "saturated": []}
     nothing["reward"] = dict.fromkeys(nothing["reward"])
     folder = tmp_path_factory.mktemp("eval")
     about = {
@@ -302,7 +302,8 @@ def test_two_policies_are_asked_the_same() -> None:
     first, second = shipped(), shipped()
     second.cfg.commands.ranges.lin_vel_x = [0.5, 0.5]
     for task in (first, second):
-        rollout.prepare_report(task)
+        rollout.prepare(task)
+        rollout.make_room(task)
     worlds = second.cfg.env.num_envs
     assert ExamRules.from_config(second.cfg) != GO1
     rollout.ask_alike([first, second])

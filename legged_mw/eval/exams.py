@@ -71,7 +71,7 @@ def _skill(kind: str) -> Exam:
 EXAMS = {
     "walking": Exam(
         sets=lambda task: rollout.SETS,
-        prepare=rollout.prepare_report,
+        prepare=rollout.prepare,
         make_room=rollout.make_room,
         ask_alike=rollout.ask_alike,
         examine=rollout.examine,

@@ -173,7 +173,7 @@ def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) ->
     ``low``, ``high``: the limits (D,), multiplied by ``margin``. Infinite means no limit, and no share is computed.
     """
     if not len(values):
-        return {"low": [], "high": [], "edges": [], "density": [], "quantiles": [], "saturated": []}
+        return {"low": [], "high": [], "edges": [], "density": [], "saturated": []}
     histograms = [np.histogram(row, BINS, density=True) for row in values.T]
     outside, limited = (
         ((values < low * margin) | (values > high * margin)).mean(axis=0),
@@ -184,7 +184,6 @@ def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) ->
         "high": [float(v) if ok else None for v, ok in zip(high, limited, strict=True)],
         "edges": [plain(edges.round(5)) for _, edges in histograms],
         "density": [plain(density.round(5)) for density, _ in histograms],
-        "quantiles": plain(np.quantile(values, (0.0, 0.05, 0.5, 0.95, 1.0), axis=0).T.round(5)),
         "saturated": [float(v) if ok else None for v, ok in zip(outside, limited, strict=True)],
     }
 

@@ -367,13 +367,7 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
             (folder / "stride.png").write_bytes(column.strip)
     if rules.peers:
         content |= {"peer": best_of(rules.peers), "peers": [peer._asdict() for peer in rules.peers]}
-    _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
+    (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], rules)
-    _write_text(
-        folder / "report.html",
-        walking_page(task, rules, columns, [(section, plots.svgs(section)) for section in sections]),
-    )
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    page = walking_page(task, rules, columns, [(section, plots.svgs(section)) for section in sections])
+    (folder / "report.html").write_text(page, encoding="utf-8")

@@ -298,12 +298,6 @@ REPORT_SIGNALS: dict[str, Signal] = {
 }
 
 
-def prepare_report(task: LoadedTask) -> None:
-    """Set the exam's overrides and the report's number of worlds in ``task``."""
-    prepare(task)
-    make_room(task)
-
-
 def make_room(task: LoadedTask) -> None:
     """Set the report's number of worlds. It depends on the command ranges."""
     task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
