@@ -68,8 +68,6 @@ def roll_out(
 
     The first ``alone`` worlds are a separate batch, so their actions do not depend on the other worlds.
     """
-    if len(cases) != env.num_envs:
-        raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
     timeline = _timeline(cases, steps, [command.default for command in env.command_table])
     requested, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)

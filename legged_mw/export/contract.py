@@ -36,10 +36,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.motors import OWN as OWN_LAW
 from legged_mw.envs.motors import motor_drive
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.export.network import (
-    INPUT,
-    OUTPUT,
-)
+from legged_mw.export.network import INPUT, OUTPUT
 from legged_mw.export.replay import ExportError, own_ends
 from legged_mw.export.scene import Scene, among_steps, standalone
 from legged_mw.rl.students.estimator import find_targets

@@ -30,13 +30,7 @@ from legged_mw.deploy.contract import (
 )
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.export.contract import make_contract, write_terrain
-from legged_mw.export.network import (
-    ExportedPolicy,
-    halve,
-    round_weights,
-    run_onnx,
-    save_onnx,
-)
+from legged_mw.export.network import ExportedPolicy, halve, round_weights, run_onnx, save_onnx
 from legged_mw.export.replay import ExportError, record, replay
 from legged_mw.rl.policies import ESTIMATE, MEMORY_INPUT, MEMORY_OUTPUT, load_policy
 from legged_mw.rl.run_folder import CONFIG_FILE, sweep

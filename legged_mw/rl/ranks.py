@@ -79,10 +79,10 @@ def first_word(word: str) -> str:
     return next((f"rank {index}: {each}" for index, each in enumerate(words) if each), "")
 
 
-def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
+def leave_together(rank: Rank) -> None:
     """Close the connection when all ranks are done. No recorded graph may use it after that.
 
-    All files are already written, so if the connection does not close within ``patience`` [s] the process ends.
+    All files are already written, so if the connection does not close within _PATIENCE the process ends.
     """
     if rank.count == 1:
         return
@@ -95,7 +95,7 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
         )
         os._exit(0)
 
-    timer = threading.Timer(patience, leave)
+    timer = threading.Timer(_PATIENCE, leave)
     timer.daemon = True
     timer.start()
     with suppress(RuntimeError):  # another rank may have ended

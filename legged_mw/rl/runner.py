@@ -498,7 +498,8 @@ def make_runner(
     """
     half = cfg.runner.matmul_precision == "bf16"
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
-    check_mirror(env, cfg)
+    if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
+        _ = env.mirror  # raises ConfigError for a row without a mirror image
     try:
         teacher_network = acting(teacher, env, [TEACHER]) if teacher else None
     except ConfigError as error:
@@ -519,12 +520,6 @@ def make_runner(
         who = "a student learns nothing but to act like its teacher" if teacher else "rsl-rl's own is used here"
         raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and {who}: set it to []")
     return runner
-
-
-def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
-    """Raise ConfigError if learning needs mirror images and a row has none, before the first rollout."""
-    if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
-        _ = env.mirror
 
 
 # ---- the progress of a training -------------------------------------------------------------------------------------

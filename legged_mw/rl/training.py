@@ -46,7 +46,7 @@ from legged_mw.rl.run_folder import (
     reason_of,
     update_from_run,
 )
-from legged_mw.rl.runner import Runner, check_mirror, make_runner
+from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_everything
@@ -221,7 +221,6 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check
     env.not_remembered = lost
     if lost:
         print(f"note: {lost}; with --resume worlds begin anew", flush=True)
-    check_mirror(env, task.train)
     check_room(task.train.to_dict(), env)
     if start.policy:
         check_start(env, task, start.policy)
