@@ -134,6 +134,17 @@ def test_after_the_last_frame_it_is_held_and_then_the_episode_times_out() -> Non
     assert env.reference.frame.tolist() == [frames + 1, frames + 4]
 
 
+def test_the_error_in_the_log_is_of_worlds_that_go_on() -> None:
+    """A world just reset is on a new frame of the clip; what it was compared with is of the episode before."""
+    env = make(worlds=8)
+    env.episode_length_buf = torch.tensor([env.max_episode_length] * 4 + [0] * 4)
+    env.step(follow(env))
+    assert env.reset_buf.tolist() == [True] * 4 + [False] * 4
+    off = 1000.0 * (env.body.pos - env.reference.wanted_pos).norm(dim=2).mean(dim=1)
+    assert off[:4].max() > 2.0 * off[4:].max()
+    assert env.read_statistics()["body_error_mm"] == pytest.approx(off[4:].mean().item(), rel=1e-4)
+
+
 def test_starts_are_drawn_by_failures() -> None:
     env = make(worlds=512, **{"motion.clips": ["resources/motions/g1_squat.npz", "resources/motions/g1_turn.npz"]})
     reference = env.reference

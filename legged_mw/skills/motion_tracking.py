@@ -157,9 +157,10 @@ class MotionTracking(RobotTask):
         return self._near(off.square().sum(dim=2), self.cfg.rewards.body_ang_vel_sigma)
 
     def _live_statistics(self) -> dict[str, Tensor]:
-        """Mean distance of the bodies from the reference, relative to the anchor [mm]."""
-        off = ((self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0).nan_to_num(0.0, 0.0, 0.0)
-        mean = torch.stack([off.sum(), torch.full_like(off[0], len(off))])
+        """Mean distance of the bodies from the reference, relative to the anchor [mm], without worlds just reset."""
+        off = (self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0
+        goes_on = ~self.reset_buf  # ``wanted_pos`` of the others is of the episode that ended
+        mean = torch.stack([torch.where(goes_on, off, 0.0).sum(), goes_on.sum(dtype=off.dtype)])
         return super()._live_statistics() | {"body_error_mm": mean}
 
     # ---- checkpoint, buffers ----------------------------------------------------------------------------------------
