@@ -146,6 +146,23 @@ def test_motors_and_ground(engine: str) -> None:
     assert all(value.min() >= 0.5 and value.max() <= 1.5 for value in values.values())
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_contact_time_is_what_the_ground_has(engine: str) -> None:
+    """MuJoCo takes one below two simulation steps as two: it is drawn, and shown to the critic, as what acts."""
+    env = make(40, engine, contact_time=[0.001, 0.02])
+    drawn, ground = env.domain_rand.values["contact_time"][:, 0], env.robot.id("geom", GROUND)
+    least = 2.0 * env.cfg.sim.dt
+    assert drawn.min().item() == pytest.approx(least) and drawn.max() > least
+    assert torch.equal(env.sim.field("geom_solref")[:, ground, 0], drawn)
+    heights = []
+    for seconds in (0.001, least, 0.02):
+        other = make(1, engine, contact_time=[seconds, seconds])
+        for _ in range(10):
+            other.step(torch.zeros(1, 12))
+        heights.append(other.sim.qpos[0, 2].item())
+    assert heights[0] == heights[1] and abs(heights[2] - heights[1]) > 1e-4
+
+
 def test_draws_fill_their_ranges_and_whole_numbers_are_equally_likely() -> None:
     env = make(3000, friction=[0.4, 1.0], action_delay=[1, 3])
     friction, delay = env.domain_rand.values["friction"], env.domain_rand.values["action_delay"]

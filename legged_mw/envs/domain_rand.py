@@ -114,6 +114,7 @@ class DomainRand:
         spans = torch.tensor(bounds, dtype=torch.float, device=sim.device).view(-1, 2)
         self._low, self._high = spans.T.contiguous()
         self._whole = [name for name in order if kinds[name][0].whole]
+        self._least_contact_time = robot.least_contact_time  # [s]
         self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg, law)}
         _check_mass(cfg, robot)
         gravity = robot.physics.opt.gravity
@@ -153,6 +154,8 @@ class DomainRand:
             column = drawn.storage_offset() - first
             if name == "delay_ms" and column >= 0:
                 fresh[:, column] = round_delay(fresh[:, column], self._substep_ms)
+            if name == "contact_time" and column >= 0:
+                fresh[:, column].clamp_(min=self._least_contact_time)
             if name in self._whole and column >= 0:
                 among = high[column] - low[column] + 1.0
                 fresh[:, column] = (low[column] + share[:, column] * among).floor_().minimum(high[column])

@@ -202,7 +202,8 @@ class RobotTaskCfg(Config):
         base_com: Places = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
         armature: Factors = [1.0, 1.05]  # factor on each joint's armature [P]
         friction: Frictions = [0.4, 1.0]  # sliding friction of the ground [-] [P]
-        contact_time: ContactTimes = []  # time constant of ground contacts (solref) [s]: longer is softer; MuJoCo 0.02
+        # time constant of ground contacts (solref), two simulation steps at least [s]: longer is softer; MuJoCo 0.02
+        contact_time: ContactTimes = []
         frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: Factors = []  # factor on each servo's position gain
         damping: Factors = []  # factor on each joint's damping

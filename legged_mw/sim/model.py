@@ -77,6 +77,12 @@ class RobotModel:
             self.physics.actuator_forcelimited[:, None] > 0, self.physics.actuator_forcerange, [-np.inf, np.inf]
         )
 
+    @property
+    def least_contact_time(self) -> float:
+        """Two time steps [s]: MuJoCo takes a shorter time constant of a contact (solref) as this, if so flagged."""
+        held = not self.physics.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
+        return 2.0 * self.physics.opt.timestep if held else 0.0
+
     def ground_geoms(self) -> slice:
         """Indices of the ground's geoms; all are geoms of the world body."""
         names = [self.physics.geom(i).name for i in range(int(self.physics.body_geomnum[0]))]
