@@ -20,8 +20,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged_mw.fast.fused_code import ADD_ROWS, ASSIGN, Writer
-from legged_mw.fast.fused_memory import HELPERS, TYPES, Access, Code, Unfit
+from legged_mw.fast.fused_code import ADD_ROWS, ASSIGN, HELPERS, TYPES, Access, Code, Unfit, Writer
 from legged_mw.fast.trace import Call, Node, Trace, alike
 
 if wp.config.log_level < wp.LOG_WARNING:  # MuJoCo's engine steps: keep warp from announcing its devices and modules
@@ -157,11 +156,9 @@ class Fused:
         for number, blocks in enumerate(self._uses()):
             for block in blocks:
                 used.setdefault(block, set()).add(number)
-        kernels = self.kernels
         for number, what in enumerate(self._steps()):
             if isinstance(what, Kernel):
                 what.write(trace, {block for block in trace.made if used.get(block) == {number}})
-        self.compiled = not kernels
         trace.steps.clear()
 
     def _steps(self) -> Iterator[Kernel | Node | Call]:
@@ -184,7 +181,6 @@ class Fused:
         """Compile the kernels that are not in warp's cache. It may run during a graph capture on the same GPU."""
         for kernel in self.kernels:
             kernel.compile()
-        self.compiled = True
 
     def verify(self) -> int:
         """Load the kernels and run one real step with them. Returns how many regions keep their original operations."""
