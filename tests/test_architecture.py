@@ -379,7 +379,7 @@ def test_few_files_of_the_core_name_what_they_do_not_import() -> None:
         # the config's default and the classes that a config may name, and where an old run's class is now
         (
             "legged_mw.rl.students",
-            ["legged_mw/rl/learner_config.py", "legged_mw/utils/renamed.py"],
+            ["legged_mw/rl/learner_config.py", "legged_mw/utils/errors.py"],
         ),
     ]:
         others = [path for path in core if not path.startswith(f"{package.replace('.', '/')}/")]

@@ -22,8 +22,7 @@ from legged_mw.rl.run_folder import update_from_run
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types, load_yaml
-from legged_mw.utils.errors import StepError, in_short
-from legged_mw.utils.renamed import LEGGED_GYM_TENSORS
+from legged_mw.utils.errors import LEGGED_GYM_TENSORS, StepError, in_short
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 

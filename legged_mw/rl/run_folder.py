@@ -35,9 +35,8 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.rl.ranks import Rank
 from legged_mw.utils.config import Config, ConfigError, load_yaml
-from legged_mw.utils.errors import brief, shown, unknown
+from legged_mw.utils.errors import MOVED, brief, shown, unknown
 from legged_mw.utils.files import check_folder, check_name, find_file, typed
-from legged_mw.utils.renamed import MOVED
 from legged_mw.utils.task import LoadedTask
 
 CONFIG_FILE = "config.yaml"
