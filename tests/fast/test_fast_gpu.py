@@ -8,7 +8,7 @@ from learner import apart, collect, difference, make, parameters, share_experien
 from test_gpu import BIPED, DEVICE, RANDOMIZED, ROUGH, make_env, roll_out, without_constraints
 from test_ppo import VARIANTS, update
 
-from legged_mw.fast import contact_count, quick_start
+from legged_mw.fast import quick_start
 from legged_mw.fast import skip_kernels as shortcuts
 from legged_mw.fast.fused import Fused
 from legged_mw.rl import networks
@@ -58,7 +58,7 @@ def test_what_physics_leaves_out_is_missed_by_nothing(task: str, monkeypatch: py
     ).to(DEVICE)
     short = roll_out(make_env(False, task), actions)
     monkeypatch.setattr(shortcuts, "KNOWN", ())
-    monkeypatch.setattr(contact_count, "countable", lambda model: {})
+    monkeypatch.setattr(shortcuts, "countable", lambda model: {})
     whole = roll_out(make_env(False, task), actions)
     # the second has an accelerometer and forces
     for group, (quantile, most) in enumerate([(0.99, 1e-3), (0.98, 1e-2)]):

@@ -12,7 +12,6 @@ import warp as wp
 from torch import Tensor
 from worlds import make_env
 
-from legged_mw.fast import contact_count
 from legged_mw.fast import skip_kernels as shortcuts
 from legged_mw.sim.warp_engine import WarpSimulation
 
@@ -33,7 +32,7 @@ def whole(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
     def switch() -> None:
         monkeypatch.setattr(shortcuts, "KNOWN", ())
-        monkeypatch.setattr(contact_count, "countable", lambda model: {})
+        monkeypatch.setattr(shortcuts, "countable", lambda model: {})
 
     return switch
 
