@@ -12,8 +12,7 @@ import torch
 
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import HeightLookup, probes
-from legged_mw.sim.height_map import HeightMap
-from legged_mw.sim.terrain import Terrain, make_terrain
+from legged_mw.sim.terrain import HeightMap, Terrain, make_terrain
 from legged_mw.sim.warp_engine import WarpSimulation
 from legged_mw.utils.errors import ModelError
 

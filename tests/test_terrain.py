@@ -15,12 +15,12 @@ from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.terrain import build_terrain
 from legged_mw.sim.ground import Ground, add_ground, as_boxes, leaning, replace_level_pieces
-from legged_mw.sim.height_map import HeightMap
 from legged_mw.sim.terrain import (
     KINDS,
     LEVEL,
     PLATFORM,
     Grid,
+    HeightMap,
     Heights,
     Terrain,
     add_kind,

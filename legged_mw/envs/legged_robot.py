@@ -21,7 +21,7 @@ from legged_mw.envs.mirror import NO_MIRROR, Block, command_block, foot_blocks, 
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask, not_sensed, require
 from legged_mw.envs.terrain import Tiles, build_terrain
-from legged_mw.sim.height_map import make_height_map
+from legged_mw.sim.engines import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners, opposites
 from legged_mw.sim.model import RobotModel, upright
 from legged_mw.sim.sensors import CONTACT_FORCE

@@ -66,7 +66,7 @@ def _field(terrain: Terrain) -> Any:
 
 
 class HeightLookup:
-    """``height_map.HeightMap`` as one kernel, which is faster on a GPU."""
+    """``HeightMap`` as one kernel, which is faster on a GPU."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
         self._device = wp.get_device(device)

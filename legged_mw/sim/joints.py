@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 import mujoco
 import numpy as np
 
-from legged_mw.sim.fixed_bodies import hold_joints, match_joints
 from legged_mw.sim.robot_file import Range, RobotFile
 from legged_mw.utils.errors import ModelError, unknown
 
@@ -78,7 +78,48 @@ def family(name: str) -> str:
     return "_".join(part for part in name.split("_") if part.lower() not in _SIDES) or name
 
 
-# ---- pose
+# ---- held joints, and the pose
+
+
+def match_joints(joints: Sequence[str], patterns: Sequence[str], what: str) -> list[str]:
+    """The joints that match a name or pattern, in the order of ``joints``. Raises ModelError without a match."""
+    for pattern in patterns:
+        if not any(fnmatchcase(joint, pattern) for joint in joints):
+            raise ModelError.of((what, unknown("joint", pattern, joints, "the MJCF")))
+    return [joint for joint in joints if any(fnmatchcase(joint, pattern) for pattern in patterns)]
+
+
+def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str, float], notes: list[str]) -> None:
+    """Weld each joint at its angle [rad]: turn its body and delete the joint. ``model``: the compiled ``spec``."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
+    for name, angle in angles.items():
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    for name, angle in angles.items():
+        joint = spec.joint(name)
+        body = joint.parent
+        if (first := body.first_joint().name) != name and first not in angles:
+            together = f"joint '{name}' moves together with '{first}' on body '{body.name}'"
+            raise ModelError.of(("held_joints", f"{together}; hold both of them, or neither"))
+        _set_pose(body, model, data)
+        spec.delete(joint)
+        notes.append(f"joint '{name}' held at {angle:g} rad")
+    for tie in list(spec.equalities):
+        if tie.type == mujoco.mjtEq.mjEQ_JOINT and {tie.name1, tie.name2} & {*angles}:
+            notes.append(f"equality '{tie.name}' dropped: it couples joints of which one is held")
+            spec.delete(tie)
+
+
+def _set_pose(body: mujoco.MjsBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Set the pose of ``body`` relative to its parent to the pose in ``data``."""
+    here, parent = data.body(body.name), data.body(int(model.body(body.name).parentid[0]))
+    back, away, quat, place = np.zeros(4), np.zeros(3), np.zeros(4), np.zeros(3)
+    mujoco.mju_negPose(away, back, parent.xpos, parent.xquat)
+    mujoco.mju_mulPose(place, quat, away, back, here.xpos, here.xquat)
+    body.set_frame(body.parent.add_frame())
+    body.pos, body.quat = place, quat
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 @dataclass(frozen=True)

@@ -9,18 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from legged_mw.sim.fixed_bodies import fuse_fixed, sensed_site
-from legged_mw.sim.geom_names import GeomNames, name_geoms
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
 from legged_mw.sim.joints import pose_joints, posed
 from legged_mw.sim.robot_file import Keyframe, RobotFile, naming, read_plain
-from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
+from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensed_site, sensor_spans
 from legged_mw.sim.servos import Drive, set_machine
 from legged_mw.sim.surface_points import add_sites, surfaces
 from legged_mw.sim.terrain import Terrain
@@ -131,9 +130,9 @@ def build_model(
     spec, notes, root = robot.spec, robot.notes, robot.root
     with naming(file):
         posed = pose_joints(robot, {"stiffness": stiffness, "damping": damping, **tables}, pose, held_joints)
-        names = name_geoms(spec, robot.where, notes, robot.lost)
+        names = _name_geoms(spec, robot.where, notes, robot.lost)
         imu = "" if imu_site is None else sensed_site(robot, posed.model, imu_site)
-        fuse_fixed(spec, notes)
+        _fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
         add_ground(spec, ground, notes)
         _set_collisions(spec, names, colliders, self_collisions, notes)
@@ -176,6 +175,24 @@ def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 
         return read_robot(file, wanted)
     return robot
+
+
+def _fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Fuse bodies without a joint into their parent link, so that fewer bodies are simulated."""
+    fixed: dict[str, list[str]] = {}
+    for body in spec.bodies:
+        carrier = body
+        while carrier.name != "world" and not carrier.joints:
+            carrier = carrier.parent
+        if carrier.name != body.name:
+            fixed.setdefault(carrier.name, []).append(body.name or "one without a name")
+    if not fixed:
+        return
+    spec.fuse_static()
+    left = {body.name for body in spec.bodies}
+    for carrier, names in fixed.items():
+        if gone := [name for name in names if name not in left]:
+            notes.append(f"fused into '{carrier}', to which they are fixed: {', '.join(gone)}")
 
 
 def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujoco.MjModel:
@@ -262,6 +279,89 @@ def _leave_out_neighbours(spec: mujoco.MjSpec, angles: Sequence[float], notes: l
     if pairs:
         overlapping = ", ".join(f"'{first}' and '{second}'" for first, second in pairs)
         notes.append(f"self-collisions left out, as they overlap in the pose: {overlapping}")
+
+
+# ---- geoms by name
+
+
+@dataclass(frozen=True)
+class GeomNames:
+    """Names of the geoms and bodies in a robot's file, including bodies that are fused later.
+
+    A geom is meant by its own name, by that of a body (all its colliding geoms), or by a pattern with * and ?.
+    """
+
+    where: str  # name of the file
+    geoms: tuple[str, ...]  # all geoms with a name
+    colliding: tuple[str, ...]  # geoms that may collide
+    bodies: dict[str, tuple[str, ...]]  # body -> its colliding geoms; without any, those of bodies fixed to it
+    lost: Mapping[str, str]  # ``RobotFile.lost``
+
+    def find(self, patterns: Sequence[str], what: str, colliding: bool = False) -> tuple[str, ...]:
+        """The geoms that match ``patterns``, each once, in their order; with ``colliding`` only colliding ones.
+
+        A name is first looked up among geoms, then among bodies. ``what``: name of the caller's parameter, for a
+        ModelError. A pattern with * or ? does not need to match ``lost`` colliders.
+        """
+        matches: dict[str, None] = {}
+        geoms = self.colliding if colliding else self.geoms
+        for pattern in patterns:
+            hits = [name for name in geoms if fnmatchcase(name, pattern)]
+            bodies = [] if hits else [name for name in self.bodies if fnmatchcase(name, pattern)]
+            hits += [geom for body in bodies for geom in self.bodies[body]]
+            if not hits:
+                for name in [name for name in self.lost if fnmatchcase(name, pattern)]:
+                    raise ModelError.of((what, self.lost[name]))
+                raise ModelError.of((what, self._no_geom(pattern, geoms, bodies, colliding)))
+            matches |= dict.fromkeys(hits)
+        return tuple(matches)
+
+    def passed_over(self, patterns: Sequence[str]) -> list[str]:
+        """A warning for each ``lost`` collider that matches one of ``patterns``."""
+        fitting = [text for name, text in self.lost.items() if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        return [f"warning: {text}" for text in dict.fromkeys(fitting)]
+
+    def _no_geom(self, pattern: str, geoms: Sequence[str], bodies: Sequence[str], colliding: bool) -> str:
+        """Message for a ``pattern`` that matches no geom. ``bodies``: the bodies that it matches."""
+        if bodies:
+            have = ", ".join(name for name, own in self.bodies.items() if own) or "none"
+            return f"body '{bodies[0]}' of {self.where} has no geom that collides; bodies that have: {have}"
+        kind = "colliding geom or body" if colliding else "geom or body"
+        text = unknown(kind, pattern, [*geoms, *self.bodies], self.where).partition("there are: ")[0]
+        return f"{text}there are: geoms {', '.join(geoms) or 'none'}; bodies {', '.join(self.bodies)}"
+
+
+def _name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str], lost: Mapping[str, str]) -> GeomNames:
+    """Give unnamed colliding geoms the name ``<body>_<number>``, and collect all names."""
+    taken = {geom.name for geom in spec.geoms}
+    for body in spec.bodies:
+        for number, geom in enumerate(body.geoms):
+            name = f"{body.name or 'body'}_{number}"
+            if geom.name or not _collides(geom):
+                continue
+            while name in taken:
+                name += "_"
+            geom.name = name
+            taken.add(name)
+            notes.append(f"geom of '{body.name}' without a name is called '{name}'")
+    named = [geom for geom in spec.geoms if geom.name]
+    colliding = [geom.name for geom in named if _collides(geom)]
+    bodies = {body.name: tuple(_own(body) or _fixed_to(body)) for body in spec.bodies[1:] if body.name}
+    return GeomNames(where, tuple(geom.name for geom in named), tuple(colliding), bodies, lost)
+
+
+def _collides(geom: mujoco.MjsGeom) -> bool:
+    return bool(geom.contype or geom.conaffinity)
+
+
+def _own(body: mujoco.MjsBody) -> list[str]:
+    return [geom.name for geom in body.geoms if _collides(geom)]
+
+
+def _fixed_to(body: mujoco.MjsBody) -> list[str]:
+    """Names of the colliding geoms of bodies that are fixed to ``body``."""
+    fixed = [child for child in body.bodies if not child.joints]
+    return [name for child in fixed for name in (*_own(child), *_fixed_to(child))]
 
 
 # ---- the standing robot

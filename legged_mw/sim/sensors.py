@@ -1,12 +1,14 @@
-"""The sensors that are added to a robot, and their columns in ``sensordata``."""
+"""The sensors that are added to a robot, with the site of its IMU, and their columns in ``sensordata``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
 import mujoco
+import numpy as np
 
 from legged_mw.sim.ground import GROUND
+from legged_mw.sim.robot_file import RobotFile
 from legged_mw.utils.errors import ModelError, unknown
 
 SELF_CONTACT = "self_contacts"  # number of contacts of the robot with itself
@@ -15,6 +17,8 @@ CONTACT_FORCE = "contact_forces"  # net force of each contact geom on the ground
 _SENS, _OBJ = mujoco.mjtSensor, mujoco.mjtObj
 _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}")) for name in ("FOUND", "FORCE"))
 _NET = 3  # reduction of the contact sensor: net force of all contacts, world frame
+_IMU = "imu"  # default name of the IMU site
+_ALIGNED = 1e-4  # [rad] axes that differ by less are parallel
 
 
 def _sense_self_contacts(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
@@ -80,3 +84,50 @@ def sensor_spans(model: mujoco.MjModel, more: Collection[str]) -> dict[str, slic
         spans[CONTACT_FORCE] = spans["contact"]  # (contacts, 4): count, force
         spans["contact"] = slice(spans["contact"].start, spans["contact"].stop, 4)
     return spans
+
+
+# ---- the IMU's site
+
+
+def sensed_site(robot: RobotFile, model: mujoco.MjModel, wanted: str) -> str:
+    """Name of a site on the root with the root's axes: ``wanted`` if it is one, else a new site at its position.
+
+    ``wanted``: a site, or a body (its origin), that is fixed to the root. Empty: the site "imu", or the root's origin
+    if that site is missing or not fixed to the root. ``model``: the compiled robot.
+    Raises ModelError if ``wanted`` does not exist or is not fixed to the root.
+    """
+    spec, root, name = robot.spec, robot.root, wanted or _IMU
+    is_site = spec.site(name) is not None
+    if not wanted and not is_site:
+        return _add_site(robot, name, np.zeros(3), f"at the origin of '{root}'")
+    if not is_site and spec.body(name) is None:
+        known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
+        raise ModelError.of(("imu_site", unknown("site or body", name, known, robot.where)))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    base, there = data.body(root), data.site(name) if is_site else data.body(name)
+    body = model.body(model.site_bodyid[there.id] if is_site else there.id)
+    welded = int(model.body_weldid[body.id])
+    if welded != model.body_weldid[base.id]:
+        joint = model.joint(int(model.body_jntadr[welded])).name
+        beyond = f"'{name}' is on body '{body.name}', which moves against the root '{root}' by joint '{joint}'"
+        if wanted:
+            instead = "take a site or body that is fixed to the root, or hold that joint by held_joints"
+            raise ModelError.of(("imu_site", f"{beyond}, so what it senses is not the root's; {instead}"))
+        why = f"at the origin of '{root}': {beyond}; imu_site may name another"
+        return _add_site(robot, f"{name}_root", np.zeros(3), why)
+    axes = base.xmat.reshape(3, 3).T
+    turn = axes @ there.xmat.reshape(3, 3)
+    if is_site and body.name == root and np.allclose(turn, np.eye(3), rtol=0.0, atol=_ALIGNED):
+        return name
+    why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
+    return _add_site(robot, f"{name}_aligned" if is_site else name, axes @ (there.xpos - base.xpos), why)
+
+
+def _add_site(robot: RobotFile, name: str, place: np.ndarray, why: str) -> str:
+    """Add a site to the root at ``place`` [m, root frame], and return its name."""
+    while robot.spec.site(name):
+        name += "_"
+    robot.spec.body(robot.root).add_site(name=name, pos=place, group=3)
+    robot.notes.append(f"site '{name}' made {why}")
+    return name

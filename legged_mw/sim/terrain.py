@@ -1,6 +1,6 @@
 """Rough ground: one height field of tiles, with levels of difficulty along x and kinds of ground along y.
 
-Heights are computed here once, on the host.
+Heights are computed here once, on the host, and looked up on the device.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from legged_mw.utils.errors import ModelError, unknown
 
@@ -136,6 +138,30 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
             most = max(shares, key=kinds.count)
             kinds[len(kinds) - 1 - kinds[::-1].index(most)] = kind
     return tuple(sorted(kinds, key=list(shares).index))
+
+
+# ---- heights on the device
+
+
+class HeightMap:
+    """The heights of a ``Terrain`` on a device. A lookup has a fixed shape and does not use the host."""
+
+    def __init__(self, terrain: Terrain, device: str) -> None:
+        self._rows, self._columns = terrain.heights.shape
+        self._heights = torch.tensor(terrain.heights, dtype=torch.float, device=device).flatten()
+        self._corner = torch.tensor(terrain.corner, dtype=torch.float, device=device)
+        self._per_cell = 1.0 / terrain.cell
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Ground height [m] at ``points`` (..., 2) [m, world]; outside the height of the edge, for NaN of a corner."""
+        place = ((points - self._corner) * self._per_cell).nan_to_num(0.0)
+        u, v = place[..., 0].clamp(0.0, self._columns - 1.0), place[..., 1].clamp(0.0, self._rows - 1.0)
+        column, row = u.floor().clamp(max=self._columns - 2.0), v.floor().clamp(max=self._rows - 2.0)
+        across, along = u - column, v - row
+        here = row.long() * self._columns + column.long()  # float32 is not exact for indices of a large field
+        low, high = self._heights[here], self._heights[here + self._columns + 1]
+        corner = torch.where(across >= along, self._heights[here + 1], self._heights[here + self._columns])
+        return low + (corner - low) * torch.maximum(across, along) + (high - corner) * torch.minimum(across, along)
 
 
 # ---- kinds of ground: (n + 1, n + 1) heights, flat at the centre and zero at the rim, so that tiles fit together

@@ -15,8 +15,7 @@ from test_symmetry import GO1, WAIST, load_robot, replaced
 from golden.table import Table
 from legged_mw.robot.draft import draft
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.fixed_bodies import match_joints
-from legged_mw.sim.joints import per_joint
+from legged_mw.sim.joints import match_joints, per_joint
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.surface_points import spheres_on
