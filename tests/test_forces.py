@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,7 +25,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export.exporter import export
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
-from legged_mw.sim.sensors import ANGULAR_MOMENTUM, CONTACT_FORCE, SELF_CONTACT, SENSORS
+from legged_mw.sim.sensors import ANGULAR_MOMENTUM, CONTACT_FORCE, SELF_CONTACT
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
@@ -76,7 +76,7 @@ def term(env: LeggedRobot, name: str) -> Any:
 
 
 def go1(more: list[str], **choices: Any) -> RobotModel:
-    sensed: dict[str, Any] = {"contact_geoms": FEET, "velocity_sites": [], "imu_site": None, "more_sensors": more}
+    sensed: dict[str, Any] = {"contact_geoms": FEET, "imu_site": "", "more_sensors": more}
     gains: dict[str, Any] = {"stiffness": {"": 35.0}, "damping": {"": 0.5}, "colliders": FEET, "self_collisions": False}
     gains["pose"] = dict(zip((f"{leg}_{part}" for leg in FEET for part in ("hip", "thigh", "calf")), HOME, strict=True))
     file = ROOT / "resources/robots/go1/go1.xml"
@@ -125,8 +125,8 @@ def test_forces_are_those_of_mj_contact_force(engine: str, cone: str) -> None:
 
 def test_nothing_more_is_sensed_unless_asked_for() -> None:
     plain, more = go1([]), go1([CONTACT_FORCE, SELF_CONTACT, ANGULAR_MOMENTUM])
-    assert plain.physics.nsensordata == 4 and [*plain.sensors] == ["contact", "linvel", "accelerometer"]
-    assert more.physics.nsensordata == 16 + 1 + 3 and more.sensors["contact"] == slice(0, 16, 4)
+    assert plain.physics.nsensordata == 4 + 3 and [*plain.sensors] == ["contact", "linvel", "accelerometer"]
+    assert more.physics.nsensordata == 16 + 3 + 1 + 3 and more.sensors["contact"] == slice(0, 16, 4)
     # what is exported
     assert [sensor.name for sensor in more.spec.sensors] == [sensor.name for sensor in plain.spec.sensors]
 
@@ -175,17 +175,6 @@ def test_a_term_that_is_on_has_what_it_needs_sensed() -> None:
         assert env.contact_forces.shape == (1, 4, 3)
     off = make_env(1, QUIET, env_class=Mine)
     assert CONTACT_FORCE not in off.robot.sensors and off.feet.forces is None
-
-
-def test_a_sensor_of_ones_own_is_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    def add(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-        kind, body = mujoco.mjtSensor.mjSENS_SUBTREECOM, mujoco.mjtObj.mjOBJ_BODY
-        spec.add_sensor(name="middle", type=kind, objtype=body, objname=root)
-
-    monkeypatch.setitem(SENSORS, "middle", add)
-    env = make_env(2, {**QUIET, "asset.sense": ["middle"]})
-    env.step(torch.zeros(2, 12))
-    assert env.sensor("middle").shape == (2, 3) and (env.sensor("middle")[:, 2] > 0.2).all()
 
 
 @pytest.mark.parametrize("engine", ENGINES)

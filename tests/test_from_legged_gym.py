@@ -368,7 +368,6 @@ def test_a_urdf_is_a_robot(tmp_path: Path) -> None:
         colliders=["*"],
         self_collisions=False,
         contact_geoms=["FR_foot", "thigh"],
-        velocity_sites=["FR_foot"],
         imu_site="",
         sites={"FR_foot": ["FR_foot"]},
     )

@@ -403,7 +403,6 @@ def test_its_export_is_a_small_text() -> None:
         colliders=["*_foot[26]_collision"],
         self_collisions=False,
         contact_geoms=[],
-        velocity_sites=[],
         imu_site="imu_in_pelvis",
         pose={"": 0.0},
     )

@@ -46,8 +46,8 @@ class Pair:
             colliders=FEET,
             self_collisions=False,
             contact_geoms=FEET,
-            velocity_sites=FEET,
             imu_site="imu",
+            sites={foot: [foot] for foot in FEET},
         )
         model = self.robot.physics
         self.sim: Any = make_simulation(model, WORLDS, "cpu", engine=engine, nconmax=8, njmax=40)

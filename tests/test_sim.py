@@ -41,8 +41,8 @@ def go1(**choices: Any) -> RobotModel:
         "colliders": FEET,
         "self_collisions": False,
         "contact_geoms": FEET,
-        "velocity_sites": FEET,
         "imu_site": "imu",
+        "sites": {foot: [foot] for foot in FEET},
     }
     return build_model(choices.pop("file", GO1), **{**defaults, **choices})
 
@@ -73,7 +73,7 @@ def toy(
 def build_toy(file: Path, **choices: Any) -> RobotModel:
     feet = ["left_foot", "right_foot"]
     defaults: dict[str, Any] = {"file": file, "stiffness": {"hip": 10.0}, "damping": {"hip": 0.2}, "colliders": feet}
-    return go1(**{**defaults, "contact_geoms": feet, "velocity_sites": feet, **choices})
+    return go1(**{**defaults, "contact_geoms": feet, "sites": {foot: [foot] for foot in feet}, **choices})
 
 
 def one_line(error: pytest.ExceptionInfo[ModelError]) -> str:
@@ -127,7 +127,6 @@ def build_soles(folder: Path, **choices: Any) -> RobotModel:
     gains = {
         "stiffness": {"": 10.0},
         "damping": {"": 0.2},
-        "velocity_sites": ["left_sole"],
         "contact_geoms": [],
         "colliders": ["*_heel"],
     }
@@ -169,8 +168,7 @@ def test_a_body_means_its_geoms_that_collide(tmp_path: Path) -> None:
 
 def test_a_missing_site_is_made_at_its_geom(tmp_path: Path) -> None:
     file = toy(tmp_path, inside='<geom name="tail" type="capsule" size="0.01" fromto="-0.1 0 0 -0.3 0 0.1"/>')
-    sites = {"tail": ["tail"], "left_foot": ["left_shin"]}
-    robot = build_toy(file, sites=sites, velocity_sites=["left_foot", "tail"])
+    robot = build_toy(file, sites={"left_foot": ["left_shin"], "tail": ["tail"]})
     np.testing.assert_allclose(robot.physics.site("tail").pos, [-0.2, 0, 0.05], atol=1e-9)
     np.testing.assert_allclose(robot.physics.site("left_foot").pos, [0, 0, -0.2], atol=1e-9)  # the MJCF's own stays
     assert robot.site_geoms == {"tail": ("tail",), "left_foot": ("left_shin",)}
@@ -358,8 +356,8 @@ def test_sensor_spans_after_the_mjcfs_own_sensors(tmp_path: Path) -> None:
     data = mujoco.MjData(robot.physics)
     mujoco.mj_forward(robot.physics, data)
     np.testing.assert_allclose(data.sensordata[robot.sensors["accelerometer"]], 0, atol=1e-9)  # falls freely
-    none = build_toy(toy(tmp_path), contact_geoms=[], velocity_sites=[], imu_site=None)
-    assert none.sensors == {name: slice(0, 0) for name in ("contact", "linvel", "accelerometer")}
+    few = build_toy(toy(tmp_path), contact_geoms=[], sites={})
+    assert few.sensors == {"contact": slice(0, 0), "linvel": slice(0, 0), "accelerometer": slice(0, 3)}
 
 
 # ---- who touches whom, by C MuJoCo

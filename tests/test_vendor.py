@@ -544,7 +544,7 @@ def part(kind: str, mesh: str) -> str:
 
 
 def build(file: Path) -> RobotModel:
-    return build_toy(file, colliders=["leg"], contact_geoms=["leg"], velocity_sites=[], imu_site="")
+    return build_toy(file, colliders=["leg"], contact_geoms=["leg"], sites={}, imu_site="")
 
 
 def test_a_mesh_that_gives_no_mass_is_looks(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_missing_mesh_that_is_no_collider_of_the_task_is_a_note(kind: str, tmp
         file = urdf(tmp_path, base=MESH)
         feet, found = ["left_leg", "right_leg"], draft(file)
         assert [foot.name for foot in found.feet] == feet
-        choices = {"velocity_sites": [], "imu_site": ""}
+        choices = {"sites": {}, "imu_site": ""}
     else:
         mesh = '<geom name="hull" type="mesh" mesh="torso" mass="0"/>'
         file = toy(tmp_path, inside=mesh, extra='<asset><mesh name="torso" file="torso.STL"/></asset>')

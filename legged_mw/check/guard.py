@@ -65,9 +65,8 @@ def check_recordable(task: LoadedTask) -> str:
     with nothing_changed(), Births(guard):
         try:
             env = _watched(task.env_class, guard)(tiny_cfg(task.cfg), "cpu", True)
-            for name in ("step", "reset", "refresh"):  # the CPU's engine may use the host
-                if method := getattr(env.sim, name, None):
-                    setattr(env.sim, name, _unwatched(method, guard))
+            for name in ("step", "reset"):  # the CPU's engine may use the host
+                setattr(env.sim, name, _unwatched(getattr(env.sim, name), guard))
             _check_rows(env)
             lost = Lost(env)
             _check_steps(env, guard)

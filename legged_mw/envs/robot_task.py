@@ -775,7 +775,6 @@ def load_robot(
             colliders=asset.colliders,
             self_collisions=asset.self_collisions,
             contact_geoms=contact_geoms,
-            velocity_sites=list(sites),
             imu_site=asset.imu_site,
             sites=sites,
             pose=cfg.init_state.default_joint_angles,

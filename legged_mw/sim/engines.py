@@ -10,7 +10,7 @@ from torch import Tensor
 from legged_mw.sim.capacity import count_capacity
 from legged_mw.sim.simulation import Simulation
 from legged_mw.sim.terrain import HeightMap, Terrain
-from legged_mw.utils.errors import EngineError, unknown
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.machine import in_bytes, require_memory
 
 ENGINES = ("auto", "mujoco_warp", "mujoco")
@@ -20,14 +20,12 @@ _SHARE = {"mujoco": 0.2, "mujoco_warp": 1.0}
 
 
 def pick_engine(name: str, device: str) -> str:
-    """The engine for ``name``; "auto": MuJoCo's own on a CPU, mujoco-warp on a GPU. Raises EngineError."""
-    if name not in ENGINES:
-        raise EngineError(unknown("engine", name, ENGINES, "the list of engines"))
+    """The engine for ``name``; "auto": MuJoCo's own on a CPU, mujoco-warp on a GPU. Raises UserError."""
     if name == "auto":
         return "mujoco" if device == "cpu" else "mujoco_warp"
     if name == "mujoco" and device != "cpu":
         text = f"the engine mujoco steps on a CPU, and the device is {device}"
-        raise EngineError(f"{text}; take the device cpu, or the engine mujoco_warp")
+        raise UserError(f"{text}; take the device cpu, or the engine mujoco_warp")
     return name
 
 

@@ -21,8 +21,8 @@ class StepGraph:
     # called once before recording; returns a function with the same results and fewer kernels
     better: Callable[[], Callable[[], None]] | None = None
 
-    def __init__(self, fn: Callable[[], None], device: str, eager: bool = False, warmup: int = 3) -> None:
-        self._fn, self._warmup = fn, warmup
+    def __init__(self, fn: Callable[[], None], device: str, eager: bool = False) -> None:
+        self._fn, self._warmup = fn, 3
         self._graph: torch.cuda.CUDAGraph | None = None
         self._stream = torch.cuda.Stream(device) if device.startswith("cuda") and not eager else None
 

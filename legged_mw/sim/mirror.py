@@ -29,7 +29,7 @@ class Partners:
     sites: tuple[int, ...]  # in the order of ``sites``
 
 
-def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float = _TOLERANCE) -> Partners:
+def find_partners(robot: RobotModel, sites: Sequence[str] = ()) -> Partners:
     """Find partners of joints and ``sites`` by positions [m] and axes with all joints at zero.
 
     Raises ModelError for a joint or site without a partner.
@@ -47,23 +47,23 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
     found, wanted = (
         [f" with {kind} axis {_numbers(axis)}" for kind, axis in zip(kinds, of, strict=True)] for of in (axes, images)
     )
-    joints = _pair("joint", robot, names, data.xanchor[joint_ids], bends, tolerance, found, wanted)
+    joints = _pair("joint", robot, names, data.xanchor[joint_ids], bends, found, wanted)
     alike, blank = np.zeros((len(sites), len(sites))), [""] * len(sites)
     return Partners(
         joints=joints,
         signs=tuple(int(signs[i, j]) for i, j in enumerate(joints)),
-        sites=_pair("site", robot, sites, data.site_xpos[site_ids], alike, tolerance, blank, blank),
+        sites=_pair("site", robot, sites, data.site_xpos[site_ids], alike, blank, blank),
     )
 
 
-def opposites(robot: RobotModel, name: str, tolerance: float = _TOLERANCE) -> list[str]:
-    """Names of the sites, geoms and bodies within ``tolerance`` [m] of the mirror image of ``name``."""
+def opposites(robot: RobotModel, name: str) -> list[str]:
+    """Names of the sites, geoms and bodies at the mirror image of ``name``."""
     model, names = robot.physics, []
     data = posed(model, np.zeros(len(robot.joint_names)))
     for kind, places in (("site", data.site_xpos), ("geom", data.geom_xpos), ("body", data.xpos)):
         if (own := mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)) >= 0:
             gaps = np.linalg.norm(places - places[own] * _POLAR, axis=1)
-            names += [getattr(model, kind)(int(i)).name for i in np.flatnonzero(gaps <= tolerance)]
+            names += [getattr(model, kind)(int(i)).name for i in np.flatnonzero(gaps <= _TOLERANCE)]
     return list(dict.fromkeys(filter(None, names)))
 
 
@@ -73,14 +73,13 @@ def _pair(
     names: Sequence[str],
     places: np.ndarray,  # (n, 3) [m], root frame
     bends: np.ndarray,  # (n, n) [rad] between the mirrored axis of i and that of j
-    tolerance: float,  # [m]
     found: Sequence[str],  # texts for the error: on each one, and (``wanted``) on its mirror image
     wanted: Sequence[str],
 ) -> tuple[int, ...]:
     """For each position the index of the one nearest to its mirror image. Raises ModelError."""
     gaps = np.linalg.norm(places[None] - (places * _POLAR)[:, None], axis=-1)  # (n, n) [m]
-    fits = (bends <= _AXIS_TOLERANCE) & (gaps <= tolerance)
-    root, within = robot.root, f"{1000 * tolerance:g} mm"
+    fits = (bends <= _AXIS_TOLERANCE) & (gaps <= _TOLERANCE)
+    root, within = robot.root, f"{1000 * _TOLERANCE:g} mm"
     for i, name in enumerate(names):
         if not fits[i].any():
             near = np.lexsort((bends[i], gaps[i].round(6)))[0]  # nearest position, then nearest axis

@@ -8,7 +8,7 @@ lists all changes to the file.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
@@ -50,19 +50,17 @@ class RobotModel:
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" and ``more_sensors`` -> columns of sensordata
     spec: mujoco.MjSpec  # the model with visual geoms and without ``more_sensors``; copy it, never change it
     names: GeomNames  # names of geoms and bodies
-    contact_geoms: tuple[str, ...] = ()  # in the order of the columns "contact"
-    site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # site of ``sites`` -> geoms
-    terrain: Terrain | None = None  # None: the plane
-    overrides: list[str] = field(
-        default_factory=list
-    )  # a line for each dropped, added or changed thing; warnings start with "warning: "
-    imu: str = ""  # site of the accelerometer, on the root and with its axes
-    pose: tuple[float, ...] = ()  # (D,) [rad] from the caller, else from the keyframe
-    held: tuple[str, ...] = ()  # welded joints of the file
-    speed_limits: tuple[float, ...] = ()  # (D,) [rad/s] of the motors, not simulated; infinite without a limit
-    tables: dict[str, list[float]] = field(default_factory=dict)  # name of the caller's table -> (D,) values
-    keyframe: Keyframe | None = None  # of the file
-    file_sensors: tuple[str, ...] = ()  # sensors of the file; only ``more_sensors`` and contact sensors are kept
+    contact_geoms: tuple[str, ...]  # in the order of the columns "contact"
+    site_geoms: dict[str, tuple[str, ...]]  # site of ``sites`` -> geoms
+    terrain: Terrain | None  # None: the plane
+    overrides: list[str]  # a line for each dropped, added or changed thing; warnings start with "warning: "
+    imu: str  # site of the accelerometer, on the root and with its axes
+    pose: tuple[float, ...]  # (D,) [rad] from the caller, else from the keyframe
+    held: tuple[str, ...]  # welded joints of the file
+    speed_limits: tuple[float, ...]  # (D,) [rad/s] of the motors, not simulated; infinite without a limit
+    tables: dict[str, list[float]]  # name of the caller's table -> (D,) values
+    keyframe: Keyframe | None  # of the file
+    file_sensors: tuple[str, ...]  # sensors of the file; only ``more_sensors`` and contact sensors are kept
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -115,9 +113,9 @@ def build_model(
     colliders: Sequence[str],  # geoms that touch the ground: names of geoms or bodies, or patterns with * and ?
     self_collisions: bool,
     contact_geoms: Sequence[str],  # geoms with a ground contact sensor: names or patterns, as for colliders
-    velocity_sites: Sequence[str],  # sites with a sensor of linear velocity, world frame [m/s]
-    imu_site: str | None,  # site of the accelerometer, in the root's axes [m/s^2]; see sensed_site; None: no sensor
-    sites: Mapping[str, Sequence[str]] = {},  # new site -> geoms (names or patterns), if the file lacks it
+    imu_site: str,  # site of the accelerometer, in the root's axes [m/s^2]; see sensed_site
+    # site with a sensor of linear velocity, world frame [m/s] -> geoms (names or patterns) for it, if the file lacks it
+    sites: Mapping[str, Sequence[str]] = {},
     pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad], over the keyframe's; None: these, or 0
     tables: Mapping[str, Mapping[str, float]] = {},  # name -> table, as for per_joint, for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns of joints that are welded at the pose
@@ -131,7 +129,7 @@ def build_model(
     with naming(file):
         posed = pose_joints(robot, {"stiffness": stiffness, "damping": damping, **tables}, pose, held_joints)
         names = _name_geoms(spec, robot.where, notes, robot.lost)
-        imu = "" if imu_site is None else sensed_site(robot, posed.model, imu_site)
+        imu = sensed_site(robot, posed.model, imu_site)
         _fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
         add_ground(spec, ground, notes)
@@ -142,7 +140,7 @@ def build_model(
         site_geoms = {name: names.find(geoms, "sites") for name, geoms in sites.items()}
         add_sites(spec, site_geoms, posed.angles, robot.where, notes)
         touching = names.find(contact_geoms, "contact_geoms")
-        add_sensors(spec, touching, velocity_sites, imu, robot.where)
+        add_sensors(spec, touching, [*sites], imu)
         whole = spec.copy()
         add_more_sensors(spec, root, touching, more_sensors)
         physics = _compile_bare(spec, ground, notes)
@@ -206,8 +204,6 @@ def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujo
 
 
 def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
-    if solver.integrator not in _INTEGRATORS:
-        raise ModelError(unknown("integrator", solver.integrator, _INTEGRATORS, "MuJoCo"))
     wanted = {
         "timestep": solver.timestep,
         "iterations": solver.iterations,

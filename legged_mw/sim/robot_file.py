@@ -159,8 +159,6 @@ def naming(file: Path) -> Iterator[None]:
         yield
     except ModelError:
         raise
-    except RecursionError:
-        raise ModelError(f"{file.name} is not a valid {kind_of(file)}: it is nested too deeply") from None
     except ValueError as error:
         why = str(error).partition("The visual elements of the spec")[0]
         raise ModelError(f"{file.name} is not a valid {kind_of(file)}: {' '.join(why.split())}") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
@@ -19,41 +19,11 @@ _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}"))
 _NET = 3  # reduction of the contact sensor: net force of all contacts, world frame
 _IMU = "imu"  # default name of the IMU site
 _ALIGNED = 1e-4  # [rad] axes that differ by less are parallel
+SENSORS = (SELF_CONTACT, ANGULAR_MOMENTUM, CONTACT_FORCE)  # on demand
 
 
-def _sense_self_contacts(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    tree = _OBJ.mjOBJ_XBODY
-    itself = {"objtype": tree, "objname": root, "reftype": tree, "refname": root, "intprm": [_FOUND, 0, 1]}
-    spec.add_sensor(name=SELF_CONTACT, type=_SENS.mjSENS_CONTACT, **itself)
-
-
-def _sense_angular_momentum(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    body = {"objtype": _OBJ.mjOBJ_BODY, "objname": root}
-    spec.add_sensor(name=ANGULAR_MOMENTUM, type=_SENS.mjSENS_SUBTREEANGMOM, **body)
-
-
-def _sense_contact_forces(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
-    """Let the sensors "contact/..." also measure the force, so that contacts are searched only once."""
-    for name in contact_geoms:
-        spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]
-
-
-# Sensors on demand: name -> function that adds the sensor, with arguments spec, root and contact geoms.
-SENSORS: dict[str, Callable[[mujoco.MjSpec, str, Sequence[str]], None]] = {
-    SELF_CONTACT: _sense_self_contacts,
-    ANGULAR_MOMENTUM: _sense_angular_momentum,
-    CONTACT_FORCE: _sense_contact_forces,
-}
-
-
-def add_sensors(
-    spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str, where: str
-) -> None:
-    """Add contact sensors of geoms, velocity sensors of sites and the accelerometer. Raises ModelError."""
-    sites = [site.name for site in spec.sites if site.name]
-    for name in (*velocity_sites, *([imu] if imu else [])):
-        if name not in sites:
-            raise ModelError(unknown("site", name, sites, where))
+def add_sensors(spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str) -> None:
+    """Add contact sensors of geoms, velocity sensors of sites, and the accelerometer at the site ``imu``."""
     geom, site = _OBJ.mjOBJ_GEOM, _OBJ.mjOBJ_SITE
     with_ground = {"type": _SENS.mjSENS_CONTACT, "reftype": geom, "refname": GROUND}
     for name in contact_geoms:
@@ -61,15 +31,21 @@ def add_sensors(
         spec.add_sensor(name=f"contact/{name}", objtype=geom, objname=name, intprm=data, **with_ground)
     for name in velocity_sites:
         spec.add_sensor(name=f"linvel/{name}", type=_SENS.mjSENS_FRAMELINVEL, objtype=site, objname=name)
-    if imu:
-        spec.add_sensor(name=f"accelerometer/{imu}", type=_SENS.mjSENS_ACCELEROMETER, objtype=site, objname=imu)
+    spec.add_sensor(name=f"accelerometer/{imu}", type=_SENS.mjSENS_ACCELEROMETER, objtype=site, objname=imu)
 
 
 def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str], more: Collection[str]) -> None:
     """Add the sensors of ``SENSORS`` in ``more``, after ``add_sensors``. Both engines compute them once per step."""
-    for name, add in SENSORS.items():
-        if name in more:
-            add(spec, root, contact_geoms)
+    if SELF_CONTACT in more:
+        tree = _OBJ.mjOBJ_XBODY
+        itself = {"objtype": tree, "objname": root, "reftype": tree, "refname": root, "intprm": [_FOUND, 0, 1]}
+        spec.add_sensor(name=SELF_CONTACT, type=_SENS.mjSENS_CONTACT, **itself)
+    if ANGULAR_MOMENTUM in more:
+        body = {"objtype": _OBJ.mjOBJ_BODY, "objname": root}
+        spec.add_sensor(name=ANGULAR_MOMENTUM, type=_SENS.mjSENS_SUBTREEANGMOM, **body)
+    if CONTACT_FORCE in more:  # the sensors "contact/..." also measure the force, so that contacts are searched once
+        for name in contact_geoms:
+            spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]
 
 
 def sensor_spans(model: mujoco.MjModel, more: Collection[str]) -> dict[str, slice]:

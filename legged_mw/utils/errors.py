@@ -47,10 +47,6 @@ class ModelError(UserError, ValueError):
         return type(self).of(*((names.get(parameter, parameter), what) for parameter, what in self.wrong))
 
 
-class EngineError(UserError, ValueError):
-    """An engine that does not exist or does not run on this device."""
-
-
 class StepError(UserError):
     """A mistake in the user's code of a task. ``what``: the fault and the remedy; ``where``: file and line."""
 

@@ -295,7 +295,7 @@ FIELDS = {  # of go1_flat
 def collide_with_leg(file: Path) -> object:
     return build_toy(
         file,
-        **{"stiffness": {"": 10.0}, "damping": {"": 0.2}, "imu_site": "", "velocity_sites": []},
+        **{"stiffness": {"": 10.0}, "damping": {"": 0.2}, "imu_site": "", "sites": {}},
         **{"colliders": ["leg"], "contact_geoms": ["leg"]},
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 from test_robot_page import WHEEL
-from test_sim import SOLES, Solver, build_toy, go1, toy
+from test_sim import SOLES, build_toy, go1, toy
 from test_symmetry import GO1, WAIST, load_robot, replaced
 
 from golden.table import Table
@@ -30,9 +30,7 @@ CHOICES: dict[str, dict[str, Any]] = {  # of the Go1
     "another collider": {"colliders": ["FR", "FL", "RR", "RLL"]},
     "another pattern": {"colliders": ["foot_*"]},
     "another foot": {"contact_geoms": ["FR", "FL", "RR", "RLL"]},
-    "another site": {"velocity_sites": ["FR", "FLL"]},
     "another IMU": {"imu_site": "imuu"},
-    "another integrator": {"solver": Solver(integrator="rk4")},
     "no file": {"file": Path("dog.xml")},
     "no URDF": {"file": Path("dog.urdf")},
 }
@@ -54,11 +52,11 @@ TOYS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     ),
     "a site of another geom": (
         {"inside": SOLES},
-        {"sites": {"left_sole": ["left_heal"]}, "velocity_sites": ["left_sole"]},
+        {"sites": {"left_sole": ["left_heal"]}},
     ),
     "a site of no geom": (
         {"inside": SOLES},
-        {"sites": {"left_sole": []}, "velocity_sites": ["left_sole"], "damping": {"": 0.2}, "stiffness": {"": 1.0}},
+        {"sites": {"left_sole": []}, "damping": {"": 0.2}, "stiffness": {"": 1.0}},
     ),
     "two joints of a body, one held": (
         {"inside": '<body name="arm"><joint name="a"/><joint name="b" axis="1 0 0"/><geom size="0.1"/></body>'},
@@ -117,7 +115,6 @@ def table() -> Table:
             "two keys fit": lambda: per_joint({"": 0.0, "hip": 1.0, "yaw": 2.0}, ["hip_yaw"], "gains"),
             "no value": lambda: per_joint({"hip": 0.0}, ["hip", "knee"], "gains"),
             "a body by name": lambda: dog().id("body", "FR_hipp"),
-            "engine: another": lambda: pick_engine("mujoco-warp", "cpu"),
             "engine: on a GPU": lambda: pick_engine("mujoco", "cuda:0"),
             "fields: not declared": lambda: simulated().field("geom_fricton"),
             "kinematics: of the world": lambda: Kinematics(dog().physics, [0], "cpu"),
