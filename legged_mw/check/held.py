@@ -22,6 +22,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.config import Config
+from legged_mw.utils.errors import LIBRARIES
 
 CONTAINERS = (dict, list, tuple, deque, TensorDictBase, nn.Module)
 _PLAIN = (
@@ -41,7 +42,6 @@ _PLAIN = (
     np.dtype,
 )
 _OTHERS = (*_PLAIN, Config, ModuleType, FunctionType, BuiltinFunctionType, MethodType, Simulation, StepGraph)
-_LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
 _FACTS = ("robot", "terrain", "clips")  # attributes of the task that no step changes
 _LIST = "_remembered"  # attribute of the task; its tensors are found under their own names
 _MODELS = ("MjModel", "MjSpec")  # classes that no step changes
@@ -64,9 +64,9 @@ class Lost:
             if not isinstance(thing, Tensor):
                 return f"what self.{name} remembers, a {type(thing).__name__}, is not kept"
         remembered = self._env.remembered().values()
-        whole = {value.data_ptr() for value in remembered if value.nbytes == value.untyped_storage().nbytes()}
+        kept = {value.data_ptr() for value in remembered if value.nbytes == value.untyped_storage().nbytes()}
         for name, value in _memory(self._env).items():
-            if value.data_ptr() not in whole and not _same(_mark(value), self._before.get(name)):
+            if value.data_ptr() not in kept and not _same(_mark(value), self._before.get(name)):
                 return f"self.{name} is written by the step and not made by self.buffer()"
         return ""
 
@@ -92,8 +92,13 @@ def _memory(env: RobotTask) -> dict[str, Tensor]:
         storage = value.untyped_storage()
         if storage.nbytes() and storage.data_ptr() not in seen:
             seen.add(storage.data_ptr())
-            storages[name] = value.as_strided((storage.nbytes() // value.element_size(),), (1,), 0)
+            storages[name] = whole(value)
     return storages
+
+
+def whole(tensor: Tensor) -> Tensor:
+    """The whole memory of a tensor as one row."""
+    return tensor.as_strided((tensor.untyped_storage().nbytes() // tensor.element_size(),), (1,), 0)
 
 
 def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Any]]:
@@ -112,7 +117,7 @@ def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Any]]:
     else:
         done.add(id(thing))
         held = parts(thing)
-        library = type(thing).__module__.partition(".")[0] in _LIBRARIES
+        library = type(thing).__module__.partition(".")[0] in LIBRARIES
         empty = isinstance(thing, set | frozenset) and all(isinstance(each, _OTHERS) for each in thing)
         if not isinstance(thing, CONTAINERS) and not empty and (library or not (held or hasattr(thing, "__dict__"))):
             yield path, thing

@@ -6,7 +6,7 @@ On a CPU all tensors are on one device. So ``Births`` notes the tensors that the
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -165,13 +165,17 @@ class _DispatchGuard(TorchDispatchMode):
                 if isinstance(value, Tensor) and not number and (known := self.guard.on_host.get(_address(value))):
                     raise NotRecordable(*known[1:])
         if self.guard.on and self.guard.on_write:
-            for i, argument in enumerate(func._schema.arguments):
-                if argument.alias_info is not None and argument.alias_info.is_write:
-                    written = args[i] if i < len(args) else kwargs.get(argument.name)
-                    for tensor in written if isinstance(written, list | tuple) else [written]:
-                        if isinstance(tensor, Tensor):
-                            self.guard.on_write(tensor)
+            for tensor in written(func, args, kwargs):
+                self.guard.on_write(tensor)
         return func(*args, **kwargs)
+
+
+def written(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Iterator[Tensor]:
+    """The tensor arguments that the kernel ``func`` writes."""
+    for i, argument in enumerate(func._schema.arguments):
+        if argument.alias_info is not None and argument.alias_info.is_write:
+            given = args[i] if i < len(args) else kwargs.get(argument.name)
+            yield from (value for value in tree_leaves(given) if isinstance(value, Tensor))
 
 
 def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any]) -> str:

@@ -20,6 +20,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from legged_mw.check.held import whole
 from legged_mw.fast.fused_code import ADD_ROWS, ASSIGN, HELPERS, TYPES, Access, Code, Unfit, Writer
 from legged_mw.fast.trace import Call, Node, Trace, alike
 
@@ -108,7 +109,7 @@ class Region:
         self.nodes = _join(nodes, trace.watched)
         self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace, device))
         written = {view.block for node in self.nodes for view in node.writes} & there
-        self._written = [_whole(trace.blocks[block]) for block in sorted(written)]
+        self._written = [whole(trace.blocks[block]) for block in sorted(written)]
 
     @property
     def kernels(self) -> list[Kernel]:
@@ -394,12 +395,6 @@ _INTO: dict[str, Callable[..., Any]] = {
     "aten.mul.Tensor": torch.ops.aten.mul.out,
     "aten.add.Tensor": torch.ops.aten.add.out,
 }
-
-
-def _whole(tensor: Tensor) -> Tensor:
-    """The whole memory of a tensor as one row."""
-    storage = tensor.untyped_storage()
-    return tensor.as_strided((storage.nbytes() // tensor.element_size(),), (1,), 0)
 
 
 def _generator(device: str) -> torch.Generator:

@@ -5,7 +5,7 @@ The trace records one real call. It identifies memory by address, so a view need
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
+from legged_mw.check.recordable import written
 from legged_mw.utils.opaque import traces
 
 
@@ -88,14 +89,14 @@ class Trace(TorchDispatchMode):
             return result
         outs = tuple(_tensors(result))
         reads = tuple(self.view(tensor) for tensor in _tensors((args, kwargs)) if tensor.numel())
-        written = [tensor for tensor in _written(func, args, kwargs) if tensor.numel()]
-        if not written:
+        changed = [tensor for tensor in written(func, args, kwargs) if tensor.numel()]
+        if not changed:
             blocks = {view.block for view in reads}
             fresh = [t for t in outs if t.numel() and self._known.get(t.untyped_storage().data_ptr(), -1) not in blocks]
             if not fresh:  # a view, or no output
                 return result
             outs = tuple(fresh)
-        writes = tuple(self.view(tensor, made=not written) for tensor in written or outs)
+        writes = tuple(self.view(tensor, made=not changed) for tensor in changed or outs)
         self.steps.append(Node(func, args, kwargs, outs, reads, writes))
         return result
 
@@ -132,13 +133,6 @@ class Trace(TorchDispatchMode):
 
 def _tensors(nested: Any) -> Iterator[Tensor]:
     return (value for value in tree_flatten(nested)[0] if isinstance(value, Tensor))
-
-
-def _written(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Iterator[Tensor]:
-    """The tensor arguments that ``func`` writes."""
-    for i, argument in enumerate(func._schema.arguments):
-        if argument.alias_info is not None and argument.alias_info.is_write:
-            yield from _tensors(args[i] if i < len(args) else kwargs.get(argument.name))
 
 
 def alike(expected: Tensor, value: Tensor, close: float, strays: float) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
-_LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
+LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
 # Control characters of a terminal, and surrogates, which no file can hold.
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _STANDARD = sysconfig.get_paths()["stdlib"]
@@ -81,7 +81,7 @@ def place_of(method: Any) -> str:
 def is_library(module: str, file: str) -> bool:
     """Whether code belongs to a library or to legged_mw.check, and not to the user's or our own code."""
     parts = module.split(".")
-    known = any(".".join(parts[:n]) in _LIBRARIES for n in range(1, len(parts) + 1))
+    known = any(".".join(parts[:n]) in LIBRARIES for n in range(1, len(parts) + 1))
     return known or file.startswith("<") or (file.startswith(_STANDARD) and "-packages" not in file)
 
 
