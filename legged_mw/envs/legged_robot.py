@@ -23,7 +23,7 @@ from legged_mw.envs.robot_task import RobotTask, not_sensed, require
 from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.engines import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners, opposites
-from legged_mw.sim.model import RobotModel, upright
+from legged_mw.sim.model import upright
 from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, command_table
@@ -370,12 +370,6 @@ class LeggedRobot(RobotTask):
             what = f"it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}"
             raise ConfigError(f"{type(self).__name__} walks by command: {what}")
         return build_terrain(self.cfg)
-
-    def _load_robot(self, engine: str) -> RobotModel:
-        try:
-            return super()._load_robot(engine)
-        except ModelError as error:
-            raise error.renamed({"sites": "asset.foot_names or foot_geoms"}) from None
 
     def _sensed_geoms(self) -> list[str]:
         """The geoms of the feet, then the others."""

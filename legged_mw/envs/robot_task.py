@@ -49,6 +49,7 @@ FIELDS = {  # parameter or table of build_model -> its config field
     **{name: f"control.{name}" for name in ("stiffness", "damping", "stall_torque", "no_load_speed", "gear")},
     **{name: f"asset.{name}" for name in ("imu_site", "colliders", "held_joints", *PARTIAL)},
     "pose": "init_state.default_joint_angles",
+    "sites": "asset.foot_names or foot_geoms",  # of those that walk; others have no sites
     "contact_geoms": "asset.penalize_contacts_on or terminate_after_contacts_on",
 }
 
