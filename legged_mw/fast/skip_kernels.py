@@ -38,8 +38,8 @@ _CONSTRAINT = wp.constant(int(ContactType.CONSTRAINT))  # a contact with a force
 _FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
 
 
-class Shortcuts:
-    """The kernels to skip in steps of one model: ``with shortcuts(sensed): mujoco_warp.step(...)``.
+class ShortStep:
+    """``mujoco_warp.step`` of one model without the skipped kernels, and with our own kernel that counts contacts.
 
     The line search of the last Newton iteration gives the final acceleration. The library then still computes gradient,
     Hessian and factors for a next iteration; these are skipped.
@@ -48,6 +48,7 @@ class Shortcuts:
     def __init__(
         self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()
     ) -> None:
+        self._model, self._data, self._count = model, data, count_contacts(mj, model)
         option, kinds = model.opt, mujoco.mjtSensor
         known = mjw.__version__ in KNOWN
         # a world without constraint rows gets the same acceleration from its first iteration, up to float32 rounding
@@ -92,9 +93,16 @@ class Shortcuts:
         if self._iterations == 1:  # only the convergence test and later iterations use its result
             self._idle.add("_update_gradient_zero_grad_dot")
 
+    def __call__(self, sensed: bool, later: bool = False) -> None:
+        """One substep. ``sensed``: it computes sensors. ``later``: it directly follows another substep."""
+        with self._skipping(sensed, later):
+            mjw.step(self._model, self._data)
+        if sensed:
+            self._count(self._data)
+
     @contextmanager
-    def __call__(self, sensed: bool, later: bool = False) -> Iterator[None]:
-        """``sensed``: this substep computes sensors. ``later``: it directly follows another substep."""
+    def _skipping(self, sensed: bool, later: bool) -> Iterator[None]:
+        """A context in which warp launches only the kernels that this substep needs."""
         idle = self._idle | (set() if sensed else self._idle_unsensed) | (self._idle_later if later else set())
         skip = _Skip(idle, self._iterations, _FORCES if sensed else ())
         zero = wp.array.zero_
@@ -115,24 +123,6 @@ class Shortcuts:
                 wp.array.zero_ = zero
                 for name, launch in whole.items():
                     setattr(wp, name, launch)
-
-
-class ShortStep:
-    """``mujoco_warp.step`` of one model without the skipped kernels, and with our own kernel that counts contacts."""
-
-    def __init__(
-        self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()
-    ) -> None:
-        self._model, self._data = model, data
-        self.shortcuts = Shortcuts(mj, model, data, world_fields)
-        self._count = count_contacts(mj, model)
-
-    def __call__(self, sensed: bool, later: bool = False) -> None:
-        """One substep; see ``Shortcuts.__call__``."""
-        with self.shortcuts(sensed, later):
-            mjw.step(self._model, self._data)
-        if sensed:
-            self._count(self._data)
 
 
 class _Skip:

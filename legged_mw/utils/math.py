@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_mw.utils.opaque import tracing
+from legged_mw.utils.opaque import traces
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
 
 def maybe_any(mask: Tensor) -> bool:
     """Whether ``mask`` may be true anywhere. On a GPU and in a traced step always True, so that nothing is read."""
-    return mask.device.type != "cpu" or tracing() or bool(mask.any())
+    return mask.device.type != "cpu" or bool(traces) or bool(mask.any())
 
 
 def spread(values: Tensor, count: int) -> Tensor:

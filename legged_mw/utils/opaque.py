@@ -19,11 +19,6 @@ R = TypeVar("R")
 traces: list[Any] = []  # active traces of fast/trace.py, innermost last
 
 
-def tracing() -> bool:
-    """Whether a trace is active."""
-    return bool(traces)
-
-
 def not_traced(method: Callable[P, R]) -> Callable[P, R]:
     """Decorate a method whose body is not traced: the compiled step calls the method itself."""
 

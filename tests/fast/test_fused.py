@@ -17,7 +17,7 @@ from legged_mw.fast.step_compiler import fused as fuse
 from legged_mw.fast.step_compiler import fused_step, remember
 from legged_mw.fast.trace import Trace
 from legged_mw.utils.math import assign
-from legged_mw.utils.opaque import not_traced, tracing
+from legged_mw.utils.opaque import not_traced, traces
 from legged_mw.utils.task import load_task
 
 N = 16
@@ -235,7 +235,7 @@ def test_calls_of_the_simulator_stay_where_they_are() -> None:
 
     program = fused(step)
     program.compile()
-    assert program.verify() == 0 and len(program.kernels) == 2 and not tracing()
+    assert program.verify() == 0 and len(program.kernels) == 2 and not traces
     memory.b[0, 1] = 4.0
     before = memory.a[2, 2].item()
     program()

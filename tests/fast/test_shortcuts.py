@@ -60,7 +60,7 @@ def test_a_step_equals_the_whole_one(case: str, whole: Callable[[], None]) -> No
         for name in b:
             left, right = (x[name] & ~expected if name.startswith("overflow") else x[name] for x in (a, b))
             assert torch.equal(left, right), f"{name} after step {i}"
-    assert env.sim._shorter.shortcuts._iterations == env.sim._model.opt.iterations
+    assert env.sim._shorter._iterations == env.sim._model.opt.iterations
     assert max(int(a["contacts"].max()) for a in short) and min(float(a["contacts"].min()) for a in short) == 0.0
 
 
@@ -91,7 +91,7 @@ def launched(sim: WarpSimulation, substeps: int = 2) -> list[str]:
 def test_what_is_left_out_is_what_the_library_launches(whole: Callable[[], None]) -> None:
     """A kernel that the library calls otherwise in a new version would be launched again, unseen."""
     sim = warp_simulation()
-    short, names = sim._shorter.shortcuts, launched(sim)
+    short, names = sim._shorter, launched(sim)
     idle = {"_gravity_force", "_qfrc_actuator_gravcomp_limits", "_next_activation", "_cfrc_world", "_contact_sort"}
     idle.add("_update_gradient_zero_grad_dot")
     assert short._idle == idle and not idle & {*names}
@@ -141,6 +141,6 @@ def test_a_world_without_constraint_rows_falls_as_before(whole: Callable[[], Non
 def test_conditions_that_need_a_launch_keep_it() -> None:
     model, sim = make_env(1).robot.physics, warp_simulation()
     put, data = sim._model, sim._data
-    assert "_gravity_force" not in shortcuts.Shortcuts(model, put, data, ["body_gravcomp"])._idle
+    assert "_gravity_force" not in shortcuts.ShortStep(model, put, data, ["body_gravcomp"])._idle
     put.opt.graph_conditional = True  # as many iterations as are needed: nobody knows the last
-    assert not shortcuts.Shortcuts(model, put, data)._iterations
+    assert not shortcuts.ShortStep(model, put, data)._iterations
