@@ -312,9 +312,8 @@ class RobotTask(BaseTask):
             Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # [m/s]
             Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro [rad/s]
             Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
-            Row(
-                "dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True
-            ),  # minus default pose [rad]
+            # minus the default pose [rad]
+            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),
             Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
             Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
         ]

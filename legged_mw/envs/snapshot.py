@@ -14,14 +14,8 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.simulation import CONSTANTS_READ
 
 MOST = 1e10  # largest valid value of a state: MuJoCo's mjMAXVAL
-_FREE = (
-    "rewards",
-    "noise",
-    "viewer",
-    "exam",
-    "ratings",
-    "termination",
-)  # sections of the config that a resumed run may change
+# sections of the config that a resumed run may change
+_FREE = ("rewards", "noise", "viewer", "exam", "ratings", "termination")
 
 
 def memory(env: RobotTask) -> dict[str, Tensor]:

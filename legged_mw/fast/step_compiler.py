@@ -13,10 +13,8 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.fast.trace import Call, Trace, alike
 
 _WORTH = 5_000  # control steps; with fewer, compiling on a CPU (seconds, once per machine) does not save time
-_CLOSE, _STRAYS = (
-    1e-3,
-    0.01,
-)  # tolerance and share of outliers of a step's writes: physics amplifies rounding, and a comparison may flip
+# tolerance and share of outliers of a step's writes: physics amplifies rounding, and a comparison may flip
+_CLOSE, _STRAYS = 1e-3, 0.01
 
 
 def fuse(env: RobotTask, steps: int) -> None:
@@ -95,10 +93,8 @@ def _fused(
     compare(expected)
     if other:
         names = sorted(other, key=lambda name: (name.startswith("sim."), name))  # the task's tensors first
-        shown, are = (
-            ", ".join(names[:5]) + ", ..." * (len(names) > 5),
-            "is another" if len(names) == 1 else "are others",
-        )
+        shown = ", ".join(names[:5]) + ", ..." * (len(names) > 5)
+        are = "is another" if len(names) == 1 else "are others"
         raise RuntimeError(
             f"{shown} {are} than by the step as it is written; does it do something that torch does not see?"
         )

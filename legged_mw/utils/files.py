@@ -108,11 +108,8 @@ def typed(path: str) -> Path:
         found = Path(path).expanduser()
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             found.stat()
-    except (
-        OSError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # too long or a link to itself; a null character; an unknown ~user
+    # too long or a link to itself; a null character; an unknown ~user
+    except (OSError, ValueError, RuntimeError) as error:
         why = getattr(error, "strerror", None) or error
         raise UserError(f"'{path[:200]}' is no path here: {why}") from None
     return found
