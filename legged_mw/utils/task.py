@@ -151,8 +151,6 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
         kind = getattr(task, part)
         if not isinstance(kind, type) or not hasattr(kind, attribute):
             raise ConfigError(f"{path}: TASK: {part} is {kind!r:.100}; it must be a class: {wanted}")
-    if not isinstance(task.exam, str | None):
-        raise ConfigError(f"{path}: TASK: exam is {task.exam!r:.100}; it must be the name of an exam, or None")
     return LoadedTask(path.stem, path, task, about=(module.__doc__ or "").partition("\n")[0])
 
 

@@ -75,7 +75,6 @@ FILES = {
     "learner second": "TASK = Task(LeggedRobot, CfgPPO, Cfg)",
     "the same config twice": "TASK = Task(LeggedRobot, Cfg, Cfg)",
     "an instance": "TASK = Task(LeggedRobot, Cfg(), CfgPPO)",
-    "an exam that is a number": "TASK = Task(LeggedRobot, Cfg, CfgPPO, 3)",
     "a field that is not there": SECTION.format("(Cfg.env)", "num_env"),
     "a section without its parent": SECTION.format("", "num_envs"),
 }
