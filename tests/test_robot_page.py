@@ -18,7 +18,7 @@ from legged_mw import ROOT
 from legged_mw.envs.statistics import BrokenWorlds, DivergenceStop
 from legged_mw.robot import __main__ as program
 from legged_mw.robot import picture
-from legged_mw.robot.draft import Draft, as_env, draft, table
+from legged_mw.robot.draft import Draft, as_env, draft, has_mirror, table
 from legged_mw.robot.measure import (
     Gains,
     Joint,
@@ -419,6 +419,20 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(
         draft(free), free, "free"
     )
+
+
+def test_sides_that_differ_by_a_fraction_of_a_millimetre_stand_alike(tmp_path: Path) -> None:
+    """As from a CAD program: the computed angles of left and right would differ in the last digit."""
+    file, calf = tmp_path / "uneven.xml", '<body name="FL_calf" pos="0 0 -0.213"'
+    bare = re.sub(r"<keyframe>.*</keyframe>", "", GO1.read_text(), flags=re.DOTALL)
+    assert bare.count(calf) == 1
+    file.write_text(bare.replace(calf, '<body name="FL_calf" pos="0.0003 0 -0.2127"'))
+    found = draft(file)
+    angles = dict(zip(found.robot.joint_names, found.pose, strict=True))
+    assert angles["FL_thigh_joint"] == angles["FR_thigh_joint"] != 0.0
+    assert angles["FL_calf_joint"] == angles["FR_calf_joint"] != 0.0
+    assert found.angles == angles
+    assert has_mirror(as_env(found, file))
 
 
 def test_a_robot_that_would_sink_gets_firmer_servos(tmp_path: Path) -> None:

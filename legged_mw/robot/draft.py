@@ -37,6 +37,7 @@ from legged_mw.robot.measure import (
 from legged_mw.robot.pose import SIDEWAYS, Judged, find_wheels, joints_to, judge_poses, walking_joints
 from legged_mw.robot.vendor import read_robot
 from legged_mw.sim.joints import family, per_joint, posed
+from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import RobotModel, standing_height
 from legged_mw.sim.surface_points import surfaces
 from legged_mw.utils.config import ConfigError
@@ -63,6 +64,7 @@ PUSHES = {"push_interval_s": 4.0, "max_push_vel_xy": 1.0, "max_push_ang_vel": 0.
 # share of each command's values at the ends of its range, for a quadruped [go2_rl_gym]
 ENDS = 0.2
 BY_CLOCK = {"contact_phase": 1.0, "no_fly": 0.5}  # reward scales of a biped that follows a gait clock
+EVEN = 0.01  # [rad] largest difference between a joint's angle and its partner's that is averaged out [ours]
 CLEARANCE = 0.003  # [m] height of the feet above the ground at reset, so that no geom penetrates it
 
 
@@ -117,6 +119,8 @@ def draft(file: Path, simple: bool = False) -> Draft:
     if held:
         robot = _bare(file, False, held, angles).robot
         pose = np.array(robot.pose)
+    pose = _even(robot, pose)
+    angles |= zip(robot.joint_names, pose.tolist(), strict=True)
     rest = stand_as_statue(robot, pose, place)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
     how = ", ".join(filter(None, (judged[0].candidate.name, judged[0].candidate.source)))
@@ -145,6 +149,20 @@ def draft(file: Path, simple: bool = False) -> Draft:
     return Draft(
         robot, pose, place, joints, gains, feet, guessed, how, notes, maker, gains_from, judged, simple, angles, wheels
     )
+
+
+def _even(robot: RobotModel, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean of ``pose`` (D,) and its mirror image, if both are alike within EVEN. Then left and right may learn alike.
+
+    The sides of many files differ by fractions of a millimetre, and so do angles that are computed from them.
+    """
+    try:
+        partners = find_partners(robot)
+    except ModelError:
+        return pose
+    image = pose[[*partners.joints]] * partners.signs
+    alike = bool(np.abs(pose - image).max() <= EVEN)
+    return (0.5 * (pose + image)).round(4) + 0.0 if alike else pose  # no -0.0
 
 
 def _servos(
