@@ -287,6 +287,20 @@ def seated(env: RobotTask, task: LoadedTask) -> torch.Tensor:
 SCAN = {"terrain.height_scan": ["state"], "terrain.measured_points_x": [-0.1, 0.1], "terrain.measured_points_y": [0.0]}
 
 
+def test_a_teacher_of_a_task_of_ones_own_is_named_by_its_task(
+    teacher: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also while another task trains, whose runs are in another folder."""
+    (tmp_path / "own_scan.py").write_text("from configs.go1_rough_scan import TASK\n")
+    run = tmp_path / "logs" / "own_scan" / "first"
+    shutil.copytree(teacher, run)
+    monkeypatch.chdir(tmp_path)
+    for name in ("own_scan", "own_scan/first", "own_scan.py", str(tmp_path / "own_scan.py")):
+        assert find_trained(name, tmp_path / "logs" / "student", "--teacher").source.folder == run
+    with pytest.raises(ConfigError, match="second"):
+        find_trained("own_scan/second", tmp_path / "logs" / "student", "--teacher")
+
+
 def test_the_teacher_sees_its_own_rows_exactly() -> None:
     """In its order, with its history, without noise and delay, whatever the student's are; the student sees what it did before."""
     delayed = {"domain_rand.enable": True, "domain_rand.observation_delay": [1, 2], "domain_rand.encoder_offset": []}

@@ -29,6 +29,7 @@ from legged_mw.rl.run_folder import (
     find_checkpoint,
     find_run,
     load_tensors,
+    logs_folder,
     runs,
     task_of,
     update_from_run,
@@ -36,7 +37,7 @@ from legged_mw.rl.run_folder import (
 from legged_mw.utils.commands import command_table
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import printable, shown, unknown
-from legged_mw.utils.files import check_folder, finish_moving, typed
+from legged_mw.utils.files import check_folder, finish_moving, typed, wrong_name
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 NETWORK_FILE = "policy.onnx"  # in an export; legged_mw.deploy defines the same name, since it does not import rl
@@ -89,15 +90,20 @@ def find_trained(
 ) -> Trained:
     """The policy that a flag names: a file, a run of ``experiment`` or at a path, an export, a task, or TASK/RUN.
 
-    Its task must be one of the project, or the file of the ``learner``'s task or of one that it extends.
+    Its task must be one of the project, or the file of the ``learner``'s task or of one that it extends. A task of
+    one's own is named by its file or by its folder of runs.
     """
     path, (task, _, run) = typed(name), name.partition("/")
     try:
-        if path.is_file():
+        if path.suffix == ".py" and path.is_file():
+            source = find_policy(load_task(name), checkpoint=checkpoint)
+        elif path.is_file():
             _refuse_checkpoint("a file", checkpoint)
             source = PolicySource(path.parent, path, shipped=False)
         elif task in task_names():
             source = find_policy(load_task(task), run or None, checkpoint)
+        elif task and not path.is_dir() and not wrong_name(task) and runs(logs_folder() / task):
+            source = _run_or_export(logs_folder() / task, run or "-1", checkpoint)
         else:
             source = _run_or_export(experiment, name, checkpoint)
         return Trained(source, load_trained(task_of(source.folder, learner), source))
