@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -131,6 +132,17 @@ def test_a_seed_turns_joints_and_seed_zero_nothing() -> None:
     assert (
         (turned[:, :7] == 0.0).all() and (np.abs(turned[:, 7:]) <= SCATTER).all() and len(np.unique(turned[:, 7])) == 3
     )
+
+
+def test_a_run_named_by_its_task_is_graded_by_its_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As by its path. A run of a task of one's own cannot be exported again without its code."""
+    run = tmp_path / "logs" / "mine" / "first"
+    shutil.copytree(GO2, run / "export")
+    monkeypatch.chdir(tmp_path)
+    for name in ("mine/first", "logs/mine/first"):
+        found = gate.find_export(name)
+        assert found is not None and found.resolve() == run / "export"
+        assert gate.find_export(name, checkpoint=3) is None
 
 
 def test_deploy_yaml_acts_as_the_contract_does(tmp_path: Path) -> None:

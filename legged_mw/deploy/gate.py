@@ -103,11 +103,12 @@ def main(export: Export) -> None:
 
 def find_export(name: str, checkpoint: int = -1) -> Path | None:
     """The export folder of ``name``: an export, a run or a shipped policy. None: the run has no export yet."""
-    folder = typed(name)
-    for path in (folder, *([folder / "export"] if checkpoint == -1 else [])):  # an export has no checkpoints
+    folder, of_task = typed(name), Path("logs", name)  # a path, or TASK/RUN
+    made = [folder / "export", of_task / "export"] if checkpoint == -1 else []  # an export has no checkpoints
+    for path in (folder, *made):
         if (path / CONTRACT_FILE).is_file():
             return find(str(path))
-    return None if folder.exists() or Path("logs", name).exists() or checkpoint != -1 else _shipped(name)
+    return None if folder.exists() or of_task.exists() or checkpoint != -1 else _shipped(name)
 
 
 def _shipped(name: str) -> Path | None:
