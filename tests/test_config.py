@@ -208,6 +208,40 @@ def test_two_parents() -> None:
                 pass
 
 
+def test_of_two_parents_only_what_changes_a_section_is_asked_for(tmp_path: Path) -> None:
+    """Python refuses a class whose first parent is extended by its second, and one with the same parent twice."""
+
+    class Plain(Base):
+        pass
+
+    class Wide(Base):
+        class env(Base.env):
+            run_name = "wide"
+
+    with pytest.raises(ConfigError, match=r"`class env\([\w.]*Wide\.env\):`"):
+
+        class Wrong(Plain, Wide):
+            class env(Base.env):
+                pass
+
+    with pytest.raises(ConfigError, match=r"`class control\([\w.]*Plain\.control\):`"):
+
+        class NotAField(Plain, Wide):
+            control = 1  # pyright: ignore[reportAssignmentType]
+
+    for parents in ("Plain.env, Wide.env", "Plain.env, LeggedRobotCfg.env"):
+        file = tmp_path / "own.py"
+        file.write_text(
+            "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n"
+            "class Plain(LeggedRobotCfg):\n    pass\n"
+            "class Wide(LeggedRobotCfg):\n    class env(LeggedRobotCfg.env):\n        num_envs = 8\n"
+            f"class Both(Plain, Wide):\n    class env({parents}):\n        num_envs = 9\n"
+        )
+        with pytest.raises(ConfigError) as refused:
+            load_task(str(file))
+        assert "own.py:8" in str(refused.value) and "TASK" not in str(refused.value)
+
+
 def test_sections_of_two_parents_are_joined_at_any_depth() -> None:
     class Robot(Base):
         class control(Base.control):

@@ -116,11 +116,7 @@ def _check_section(cls: type, name: str, section: type, known: dict[str, Any]) -
 
 def _joined(cls: type, name: str, sections: list[type]) -> type:
     """The section of a class that does not write it: the fields of all parents' `sections`. The first parent wins."""
-    last = [
-        section
-        for section in dict.fromkeys(sections)
-        if not any(other is not section and issubclass(other, section) for other in sections)
-    ]
+    last = _last(sections)
     joined = last[0]
     if len(last) > 1:
         names = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.{name}"}
@@ -128,6 +124,15 @@ def _joined(cls: type, name: str, sections: list[type]) -> type:
     if joined is not getattr(cls, name):
         setattr(cls, name, joined)
     return joined
+
+
+def _last(sections: list[type]) -> list[type]:
+    """The `sections` that no other one extends, each once."""
+    return [
+        section
+        for section in dict.fromkeys(sections)
+        if not any(other is not section and issubclass(other, section) for other in sections)
+    ]
 
 
 def _declared_type(cls: type, name: str, inherited: Any) -> Any:
@@ -180,7 +185,12 @@ def _path(cls: type) -> str:
 
 
 def _parents(cls: type, name: str) -> str:
-    return ", ".join(f"{_path(base)}.{name}" for base in cls.__bases__ if name in _schema(base))
+    """The section `name` of the parents as a class statement lists it: without those that another one extends."""
+    owners: dict[type, str] = {}  # section -> its name in the first parent that has it
+    for base in cls.__bases__:
+        if name in _schema(base):
+            owners.setdefault(_schema(base)[name], f"{_path(base)}.{name}")
+    return ", ".join(owners[section] for section in _last([*owners]))
 
 
 def type_text(kind: Any) -> str:

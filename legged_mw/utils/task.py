@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -139,6 +140,8 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
         raise ConfigError(f"{where}: {error.msg}: {(error.text or '').strip()[:100]}") from error
     except (Exception, SystemExit) as error:
         remedy = "" if isinstance(error, ImportError) else f"; {shown(path)} {_ENDS}"
+        if isinstance(error, TypeError) and re.search(r"\(MRO\)|duplicate base class", str(error)):
+            remedy = "; one of these parents is the other one, or extends it: name only the last of them"
         raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}{remedy}") from error
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
