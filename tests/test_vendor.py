@@ -294,6 +294,23 @@ def test_a_motors_range_is_its_force_limit(tmp_path: Path) -> None:
     assert text in robot.overrides
 
 
+def test_an_actuators_armature_is_its_joints(tmp_path: Path) -> None:
+    """MuJoCo's actuators have rotors too, before their gear. They were lost with the actuators, and nothing said so."""
+    motors = """<actuator><motor joint="left_hip" gear="-3" armature="0.02" ctrlrange="-6 5"/>
+      <position joint="right_hip" forcerange="-3 3" armature="0.01"/></actuator>"""
+    file = toy(tmp_path, extra=motors)
+    model, robot = mujoco.MjModel.from_xml_path(str(file)), build_toy(file)
+    assert robot.physics.dof_armature[6:].tolist() == pytest.approx([0.18, 0.01])
+    matrices = []
+    for each in (model, robot.physics):
+        data, matrix = mujoco.MjData(each), np.zeros((each.nv, each.nv))
+        mujoco.mj_forward(each, data)
+        mujoco.mj_fullM(each, data, matrix)
+        matrices.append(matrix)
+    np.testing.assert_allclose(matrices[1], matrices[0], atol=1e-9)
+    assert sum("armature" in line for line in robot.overrides) == 2
+
+
 def test_an_infinite_servo_is_a_warning_that_names_the_field(tmp_path: Path) -> None:
     (tmp_path / "bare.xml").write_text(
         (HERE / "g1_12dof_style.xml").read_text().replace('actuatorfrcrange="-139 139"', "")
@@ -381,6 +398,11 @@ def test_what_a_files_defaults_say_is_not_of_what_is_added(tmp_path: Path) -> No
     floor, foot = robot.physics.geom("floor"), robot.physics.geom("left_foot")
     assert (floor.margin[0], floor.solref[0], foot.margin[0]) == (0.0, 0.02, 0.01)
     assert (robot.physics.actuator_gear[:, 0] == 1).all() and not robot.physics.actuator_forcelimited.any()
+    defaults = """<default><geom surfacevel="1 0 0"/>
+        <motor armature="0.1" damping="0.5" delay="0.01" nsample="3"/></default>"""
+    model = build_toy(toy(tmp_path, extra=defaults)).physics
+    assert not model.actuator_armature.any() and not model.actuator_damping.any() and not model.actuator_delay.any()
+    assert not model.geom_surfacevel[model.geom("floor").id].any()
 
 
 def test_ties_to_the_world_are_dropped(tmp_path: Path) -> None:

@@ -38,9 +38,11 @@ _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _ROUNDING = 1e-9  # share of the largest moment of inertia
 _THIN = 1e-3  # smallest (thickness / length)^2 of a body with corrected inertia, about [ours]
 _ADDED = {  # attributes of defaults that would apply to elements added to the robot
-    "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
+    "geom": "type pos quat contype conaffinity condim priority friction solmix solref solimp margin gap "
+    "surfacevel adhesion rgba group density material",
     "site": "type size group rgba material",
-    "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
+    "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange "
+    "actlimited actrange armature damping delay nsample interp",
 }
 _KEPT_SENSORS = "TOUCH FORCE TORQUE RANGEFINDER CONTACT GEOMDIST GEOMNORMAL GEOMFROMTO USER PLUGIN TACTILE"
 _SENSED = re.compile(
@@ -58,6 +60,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         source = XmlSource(file)
         spec, speeds = read_urdf(source, notes, lost) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
+        _take_armatures(spec, notes)
         limits = _take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
         sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
@@ -84,6 +87,15 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
         for body in spec.bodies[1:]:
             for name in ("explicitinertial", "mass", "ipos", "iquat", "inertia", "fullinertia"):
                 setattr(body, name, getattr(fresh, name))
+
+
+def _take_armatures(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Add the inertias of the actuators' rotors, reflected by their gears, to the armatures of their joints."""
+    for actuator in spec.actuators:
+        joint = spec.joint(actuator.target) if actuator.trntype in _JOINTS else None
+        if joint is not None and joint.type in SCALAR_JOINTS and actuator.armature:
+            old, joint.armature = joint.armature, joint.armature + actuator.armature * actuator.gear[0] ** 2
+            notes.append(f"{joint.name} armature: {old:g} -> {joint.armature:g} kg m^2, with its actuator's")
 
 
 def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
