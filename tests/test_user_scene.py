@@ -121,6 +121,22 @@ def test_joints_without_a_limit_get_the_exports(tmp_path: Path) -> None:
     assert np.delete(found, calf).tolist() == np.delete(exported, calf).tolist()
 
 
+def test_a_motors_rotor_stays_and_its_defaults_go(tmp_path: Path) -> None:
+    def geared(root: ElementTree.Element) -> None:
+        default = ElementTree.SubElement(root, "default")
+        ElementTree.SubElement(default, "motor", {"damping": "0.5", "delay": "0.01", "nsample": "3"})
+        for motor in root.iter("motor"):
+            motor.attrib |= {"armature": "0.001", "gear": "2"}
+
+    plain, changed = (
+        DeployStage(GO2, 1, scene_file=vendors(tmp_path, each)).fleet for each in (lambda _: None, geared)
+    )
+    more = changed.model.dof_armature[changed._dofs] - plain.model.dof_armature[plain._dofs]
+    assert more.ravel() == pytest.approx(0.004)
+    for name in ("armature", "damping", "delay"):
+        assert not getattr(changed.model, f"actuator_{name}").any()
+
+
 def test_a_scene_without_a_ground_gets_one(tmp_path: Path) -> None:
     def bare(root: ElementTree.Element) -> None:
         for world in root.findall("worldbody"):

@@ -99,7 +99,10 @@ def _in_scene(
 
 
 def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Remove the file's actuators and keyframes. Returns joint -> largest torque [N m], where an actuator states it."""
+    """Remove the file's actuators and keyframes. Returns joint -> largest torque [N m], where an actuator states it.
+
+    The inertia of an actuator's rotor, reflected by its gear, becomes its joint's armature.
+    """
     limits: dict[str, float] = {}
     for actuator in list(spec.actuators):
         gear = abs(float(actuator.gear[0]))
@@ -108,6 +111,8 @@ def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
             limits[actuator.target] = gear * float(np.abs(force).max())
         elif actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and control[1] > control[0]:
             limits[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and (joint := spec.joint(actuator.target)):
+            joint.armature += actuator.armature * gear**2
         spec.delete(actuator)
     for key in list(spec.keys):  # a keyframe has a control for each actuator
         spec.delete(key)
@@ -185,6 +190,10 @@ def _make_ready(spec: mujoco.MjSpec, contract: Contract, limits: dict[str, float
             gainprm=[stiffness, *[0.0] * 9],
             biasprm=[0.0, -stiffness, -damping, *[0.0] * 7],
             gear=[1.0, *[0.0] * 5],
+            armature=0.0,  # the file's defaults may have others
+            damping=[0.0] * 3,
+            delay=0.0,
+            nsample=0,
             ctrllimited=False,
             **limit,
         )
