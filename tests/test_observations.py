@@ -6,6 +6,9 @@ import torch
 from torch import Tensor
 from worlds import QUIET, STATE, layout, make_env
 
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
+
 
 def test_rows_left_out_are_gone_from_the_group_and_from_what_contains_it() -> None:
     env = make_env(3, {**QUIET, "observations.leave_out": {"state": ["base_lin_vel", "commands"]}})
@@ -72,6 +75,21 @@ def test_mirrored_history_is_the_history_of_the_mirrored() -> None:
     image = env.mirror.observations["state"](x)
     assert torch.allclose(image, torch.cat(expected, dim=1), atol=1e-6)
     assert torch.allclose(env.mirror.observations["state"](image), x, atol=1e-5)
+
+
+def test_a_row_has_one_scale_or_one_a_column() -> None:
+    class Scaled(LeggedRobot):
+        def observation_rows(self) -> dict[str, list[Row | str]]:
+            rows = super().observation_rows()
+            for name, scale in {"list": [2.0] * 11 + [3], "tuple": (2.0,) * 11 + (3,), "one": 2}.items():
+                rows["state"].append(Row(name, self.dof_vel, scale=scale))
+            return rows
+
+    env = make_env(2, QUIET, env_class=Scaled)
+    env.step(torch.randn(2, 12))
+    state, three = env.obs_buf["state"], torch.tensor([2.0] * 11 + [3.0])
+    for name, scale in {"list": three, "tuple": three, "one": 2.0}.items():
+        assert torch.equal(state[:, env.observations.span("state", name)], env.dof_vel * scale)
 
 
 def test_a_restart_between_steps_leaves_histories_of_other_worlds() -> None:

@@ -25,7 +25,7 @@ class Row(NamedTuple):
     noise: float = 0.0  # half width of the added uniform noise, in the unit of the value
     # mirror image: a kind of envs/mirror.py, or a group; None: unknown, so symmetry must be off
     mirror: str | None = None
-    scale: float | tuple[float, ...] = 1.0  # one number, or one per column; the policy reads scale * (value + noise)
+    scale: float | Sequence[float] = 1.0  # one number, or one per column; the policy reads scale * (value + noise)
     measured: bool = False  # a sensor of the robot measures it, so domain_rand.observation_delay applies
     # How a robot with an exported policy measures it (legged_mw/deploy/contract.py knows RobotTask's rows by name):
     sensors: tuple[str, ...] = ()  # names of sensors in the MJCF; the row is their values in order
@@ -42,12 +42,12 @@ class Row(NamedTuple):
     def column_scales(self) -> list[float]:
         """The scale of each column of ``value``. Raises ConfigError unless there is one scale, or one per column."""
         size = self.value.shape[1]
-        if not isinstance(self.scale, tuple):
+        if not isinstance(self.scale, Sequence):
             return [float(self.scale)] * size
         if len(self.scale) != size:
             what = f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales"
             raise ConfigError(f"{what}; give one, or one a column")
-        return list(self.scale)
+        return [float(scale) for scale in self.scale]
 
 
 def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
