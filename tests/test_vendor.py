@@ -405,6 +405,18 @@ def test_what_a_files_defaults_say_is_not_of_what_is_added(tmp_path: Path) -> No
     assert not model.geom_surfacevel[model.geom("floor").id].any()
 
 
+def test_a_flag_of_the_file_switches_nothing_of_the_robot_off(tmp_path: Path) -> None:
+    flags = "constraint equality frictionloss limit contact spring damper gravity clampctrl actuation sensor"
+    switches = " ".join(f'{flag}="disable"' for flag in flags.split())
+    robot = build_toy(toy(tmp_path, extra=f"<option><flag {switches} warmstart='disable'/></option>"))
+    bits = mujoco.mjtDisableBit
+    assert robot.physics.opt.disableflags == bits.mjDSBL_EULERDAMP | bits.mjDSBL_WARMSTART
+    assert not any(line.startswith("warning: gravity") for line in robot.overrides)
+    light = build_toy(toy(tmp_path, extra='<option gravity="0 0 -3.7"/>'))
+    assert light.physics.opt.gravity[2] == -3.7
+    assert any(line.startswith("warning: gravity") and "-3.7" in line for line in light.overrides)
+
+
 def test_ties_to_the_world_are_dropped(tmp_path: Path) -> None:
     ties = """<contact><pair name="p" geom1="shell" geom2="left_foot"/><exclude body1="base" body2="left_leg"/></contact>
       <equality><weld name="hook" body1="base"/><joint name="couple" joint1="left_hip" joint2="right_hip"/></equality>"""

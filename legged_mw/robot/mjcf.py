@@ -157,7 +157,7 @@ class _Reader:
         self.urdf = self.urdf or (tag == "robot" and self.depth == 1)
         unread = self.urdf and tag not in _OF_URDF  # ignored, such as a simulator's plugins
         for name, value in attributes.items():
-            if wrong := "" if name in _NAMES else _wrong(name, value):
+            if wrong := "" if name in _NAMES or tag == "flag" else _wrong(name, value):
                 raise ValueError(f'{self.where}{name}="{value[:60]}" {wrong}')
             if value and not unread and (name.startswith("file") or name in _DIRS):
                 self._note(name, value)

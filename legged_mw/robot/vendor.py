@@ -35,6 +35,7 @@ from legged_mw.utils.errors import ModelError
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # number of columns in qpos; other joints have one
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _ROUNDING = 1e-9  # share of the largest moment of inertia
 _THIN = 1e-3  # smallest (thickness / length)^2 of a body with corrected inertia, about [ours]
 _ADDED = {  # attributes of defaults that would apply to elements added to the robot
@@ -74,6 +75,9 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
             model = compile_readable(spec, where, notes, lost)
         check_model(model)
         notes += [f"warning: {' '.join(str(each.message).split())}" for each in caught]
+        if np.abs(model.opt.gravity - _GRAVITY).max() > 0.05:
+            numbers = " ".join(f"{number:g}" for number in model.opt.gravity)
+            notes.append(f"warning: gravity is {numbers} m/s^2, as the file says")
     _check_joints(spec, where)
     return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors, lost)
 

@@ -27,6 +27,10 @@ from legged_mw.utils.errors import ModelError, unknown
 
 _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}  # options that are bit masks
 _ENUMS = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver, **_FLAGS}
+# flags of a file that would switch off physics of the robot
+_NEEDED = ("CONSTRAINT", "EQUALITY", "FRICTIONLOSS", "LIMIT", "CONTACT", "SPRING", "DAMPER", "GRAVITY")
+_NEEDED += ("CLAMPCTRL", "ACTUATION", "SENSOR")
+_SWITCHED_OFF = sum(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}").value for name in _NEEDED)
 _INTEGRATORS = {"euler": mujoco.mjtIntegrator.mjINT_EULER, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
 
 
@@ -215,7 +219,7 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
         "noslip_iterations": 0,  # mujoco-warp does not have it
         "enableflags": 0,
         # explicit joint damping with Euler; implicitfast ignores this flag
-        "disableflags": spec.option.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value,
+        "disableflags": spec.option.disableflags & ~_SWITCHED_OFF | mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value,
     }
     for name, value in wanted.items():
         old = getattr(spec.option, name)
