@@ -59,7 +59,7 @@ class LeggedGymRobot(LeggedRobot):
                 Row("commands", self.commands, mirror="command", scale=velocities),
                 Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", scale=scale.dof_pos, measured=True),
                 Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", scale=scale.dof_vel, measured=True),
-                Row("last_actions", self.last_actions, mirror="joint"),
+                Row("last_actions", self.last_actions, mirror="action"),
                 *(row._replace(scale=scale.height_scan) for row in self._height_rows("state", noise.height_scan)),
             ]
         }

@@ -346,6 +346,22 @@ def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_reward
     assert env.sim.overflow_report() == ""
 
 
+def test_a_mirrored_action_moves_its_joint_as_far_as_the_action_its_own() -> None:
+    """Also where an action of 1 turns the right hips the other way, or one joint twice as far as its partner."""
+    scales = {"": 0.25, "FR_hip": -0.25, "RR_hip": -0.25, "FL_calf": 0.5}
+    env, plain = make_env(2, {**QUIET, "control.action_scale": scales}), make_env(2, QUIET)
+    scale, turns = env.actuators.scale, torch.randn(5, 12)  # [rad] that the joints are asked to turn
+    actions = mirror(env, None, turns / scale)[1]
+    wanted = mirror(plain, None, turns)[1]
+    assert actions is not None and wanted is not None
+    torch.testing.assert_close(actions * scale, wanted)
+    env.step(turns[:2] / scale)
+    image = mirror(env, env.get_observations(), None)[0]
+    assert image is not None
+    span = env.observations.span("state", "last_actions")
+    torch.testing.assert_close(image["state"][2:, span], mirror(env, None, env.last_actions)[1][2:])  # type: ignore[index]
+
+
 # ---- rows of one's own
 
 

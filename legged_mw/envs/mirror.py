@@ -68,7 +68,7 @@ def make_mirror(groups: Mapping[str, Sequence[Row]], blocks: dict[str, Block], r
     blocks = dict(blocks)
     for group, rows in groups.items():
         blocks[group] = _group_block(group, rows, blocks, reach)  # later groups may contain this one
-    return Mirror({group: _columns(blocks[group], device) for group in groups}, _columns(blocks["joint"], device))
+    return Mirror({group: _columns(blocks[group], device) for group in groups}, _columns(blocks["action"], device))
 
 
 def _columns(block: Block, device: str) -> Columns:
@@ -79,15 +79,17 @@ def _columns(block: Block, device: str) -> Columns:
         return Columns(index, sign, target.long(), source.long(), factor)
 
 
-def robot_blocks(partners: Partners) -> dict[str, Block]:
-    """Kinds of mirror image for all robots."""
+def robot_blocks(partners: Partners, action_scale: Sequence[float]) -> dict[str, Block]:
+    """Kinds of mirror image for all robots. ``action_scale`` (D,): what a joint does with an action of 1."""
     joints = Block(list(partners.joints), [float(sign) for sign in partners.signs])
+    ratios = [action_scale[j] / scale for j, scale in zip(joints.index, action_scale, strict=True)]
     return {
         "scalar": Block([0], [1.0]),  # the same on both sides
         "polar": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # x, -y, z: a velocity, a force, a direction
         "axial": Block([0, 1, 2], [-1.0, 1.0, -1.0]),  # -x, y, -z: an angular velocity
         "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # body frame; with shifts from the row "base_ang_vel"
         "joint": joints,  # one value per joint
+        "action": Block(joints.index, [sign * ratio for sign, ratio in zip(joints.sign, ratios, strict=True)]),
         "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # one value per joint, without a sign
         "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # root's, then joints'
     }

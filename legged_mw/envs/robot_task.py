@@ -315,7 +315,7 @@ class RobotTask(BaseTask):
             # minus the default pose [rad]
             Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),
             Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
-            Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
+            Row("last_actions", self.last_actions, mirror="action"),  # a_t, clipped
         ]
 
     def _body_rows(self) -> list[Row]:
@@ -350,7 +350,7 @@ class RobotTask(BaseTask):
         """Name -> kind of mirror image, for rows."""
         partners = self._partners()
         check_pose(self.robot.joint_names, self.default_dof_pos.tolist(), partners)
-        return robot_blocks(partners)
+        return robot_blocks(partners, self.robot.tables["control.action_scale"])
 
     def _partners(self) -> Partners:
         return find_partners(self.robot)

@@ -112,7 +112,7 @@ class MotionTracking(RobotTask):
                 Row("body_pos", self.body_pos, mirror="body_polar"),  # of each body, anchor frame [m]
                 Row("body_ori", self.body_ori, mirror="body_turn"),  # two columns of each body's rotation
                 *self._body_rows(),
-                Row("last_actions", self.last_actions, mirror="joint"),
+                Row("last_actions", self.last_actions, mirror="action"),
                 *self._disturbance_rows(),
             ],
         }
