@@ -20,6 +20,7 @@ from legged_mw.check.describe import describe
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.simulated import Fleet
+from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motors import SubstepDelay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -161,6 +162,23 @@ def test_physics_hears_a_delay_of_7_ms(engine: str, law: str) -> None:
         twin.sim.step(3)
         env.step(action)
         torch.testing.assert_close(env.sim.qpos, twin.sim.qpos, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("origin", ["default", "joints", "targets"])
+def test_a_delay_of_a_control_step_is_one_of_as_many_milliseconds(origin: str) -> None:
+    """Also where a target is made from measured angles: they are those that the policy acted on."""
+    drawn = {f"domain_rand.{name}": [] for name in KINDS} | {"domain_rand.encoder_offset": [0.02, 0.02]}
+    same = {**QUIET, **STILL, **drawn, "domain_rand.enable": True}
+    same |= {"control.action_origin": origin, "control.action_scale": 0.1}
+    env = make_env(2, {**same, "domain_rand.action_delay": [1, 1]})
+    twin = make_env(2, {**same, "domain_rand.delay_ms": [1e3 * env.dt, 1e3 * env.dt]})
+    twin.sim.qpos.copy_(env.sim.qpos)
+    for _ in range(5):
+        action = torch.randn(2, 12)
+        env.step(action)
+        twin.step(action)
+        torch.testing.assert_close(env.sim.qpos, twin.sim.qpos, atol=2e-5, rtol=0)
+    assert (env.dof_offset.abs() > 0.02).any()
 
 
 def test_delays_are_rounded_to_the_nearest_simulation_step_a_half_up() -> None:

@@ -131,7 +131,8 @@ class Actuators:
         self._start: Tensor | float = default if by_angle else 0.0  # targets at the start of an episode
         self._delay: Delay | None = None
         if "action_delay" in drawn:
-            self._delay = Delay(cfg, "action_delay", drawn["action_delay"], len(scale), start=0.0)
+            start = default if self._origin == "joints" else 0.0
+            self._delay = Delay(cfg, "action_delay", drawn["action_delay"], len(scale), start)
         self._late = SubstepDelay(cfg, drawn["delay_ms"], len(scale)) if "delay_ms" in drawn else None
         # (N, D) sent to the motors: targets minus encoder offsets, torques, or actions for OWN
         self._sent = sim.ctrl
@@ -153,13 +154,17 @@ class Actuators:
 
     def apply(self, actions: Tensor) -> None:
         """Compute the motor commands of ``actions`` (N, D)."""
-        actions = self._delay(actions) if self._delay else actions
+        # a target from measured angles is delayed as a whole: the angles are those that the policy acted on
+        late_target = self._delay if self._origin == "joints" else None
+        actions = self._delay(actions) if self._delay and not late_target else actions
         if self.law == OWN:
             self._sent.copy_(actions)
         elif self.law == "torque" or self._origin == "speed":
             torch.mul(actions, self.scale, out=self.targets)
         else:
             torch.addcmul(self._origin_angles(), actions, self.scale, out=self.targets)
+            if late_target:
+                self.targets.copy_(late_target(self.targets))
             if self._offset is not None:
                 torch.sub(self.targets, self._offset, out=self._sent)
         if self._late:
@@ -268,9 +273,11 @@ class Delay:
 
     written = ("past", "_new")
 
-    def __init__(self, cfg: RobotTaskCfg, name: str, steps: Tensor, width: int, start: float | None = None) -> None:
+    def __init__(
+        self, cfg: RobotTaskCfg, name: str, steps: Tensor, width: int, start: Tensor | float | None = None
+    ) -> None:
         """``steps`` (N, 1), drawn by ``domain_rand.<name>``, is read in each call. ``start``: value before the start of
-        an episode; None: the first value of the episode.
+        an episode, one or (width,); None: the first value of the episode.
         """
         self.steps, self.start, longest = steps, start, int(getattr(cfg.domain_rand, name)[1])
         _require_memory(cfg, name, steps, longest + 1, width)
