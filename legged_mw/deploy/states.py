@@ -35,7 +35,7 @@ STIFFEN = 1.0  # [share of the stiffness per second]
 # IMU check while the robot stands up. Ours: the shipped Go1 and Go2 tilt by 0.1 rad in total. With right axes the tilt
 # by gyro or legs differs from the tilt by gravity by a share of 0.05, with wrong axes by 0.7.
 TILTS, MISSED = 0.03, 0.6  # [rad] smallest tilt for a check; largest allowed difference, share of the tilt
-TURN = 5  # measurements per mean; single measurements are noisy, and their times are not exact
+TURN = 0.1  # [s] of measurements per mean; single measurements are noisy, and their times are not exact
 # [rad] roll to each side while standing up, with three feet or more; largest joint motion for it
 SWAY, BEND = 0.06, 0.15
 # [deg] largest angle between gravity and the legs' estimate of it; it includes the slope and encoder offsets
@@ -45,12 +45,18 @@ STANDS = 0.3  # [rad] largest distance from the pose to start a policy; ours: th
 
 
 _IMU = ("ang_vel", "gravity", "acceleration")
-KEPT = 125  # stored measurements while standing up: 2.5 s, because a gyro's bias accumulates
+KEPT = 2.5  # [s] of stored measurements while standing up, longer than RISE; a gyro's bias accumulates
 
 
-def _in_turns(values: Floats) -> Floats:
-    """Means (N // TURN, 3) over TURN rows of ``values`` (N, 3). They reduce noise and errors of the times."""
-    return values[: len(values) // TURN * TURN].reshape(-1, TURN, 3).mean(axis=1)
+def _per_mean(period: float) -> int:
+    """Measurements per mean."""
+    return max(1, round(TURN / period))
+
+
+def _in_turns(values: Floats, period: float) -> Floats:
+    """Means (M, 3) over each TURN [s] of ``values`` (N, 3). They reduce noise and errors of the times."""
+    count = _per_mean(period)
+    return values[: len(values) // count * count].reshape(-1, count, 3).mean(axis=1)
 
 
 def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
@@ -61,12 +67,12 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
     checks: all sensors of the IMU are rotated in the same way, or all swap the same axes and nothing tilts along the
     third. ``at_odds`` detects these.
     """
-    if len(seen) <= TURN:
+    if len(seen) <= _per_mean(period):
         return ""
     gyro, gravity, acceleration = (np.array([getattr(each, name) for each in seen]) for name in _IMU)
     increments = -period * np.cross(gyro[1:] + gyro[:-1], gravity[1:] + gravity[:-1]) / 4
     gyro_tilt, gravity_tilt = (
-        np.diff(_in_turns(each), axis=0) for each in (np.cumsum(increments, axis=0), gravity[1:])
+        np.diff(_in_turns(each, period), axis=0) for each in (np.cumsum(increments, axis=0), gravity[1:])
     )
     by_gyro, by_gravity, difference = (
         float(np.linalg.norm(each)) for each in (gyro_tilt, gravity_tilt, gyro_tilt - gravity_tilt)
@@ -80,17 +86,17 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
     return f"gravity is {angle:.0f} degrees from what the accelerometer feels" if angle > PLUMB else ""
 
 
-def at_odds(legs: Floats, gravity: Floats) -> str:
-    """Compare measured ``gravity`` (N, 3), one per period, with the estimate of the ``legs`` (N, 3).
+def at_odds(legs: Floats, gravity: Floats, period: float) -> str:
+    """Compare measured ``gravity`` (N, 3), one per ``period`` [s], with the estimate of the ``legs`` (N, 3).
 
     Returns the difference in words; "" if they agree, or if there are too few estimates.
     On a slope the two differ by a constant. Pitch and roll must therefore change equally, and the constant must not
     exceed STEEP.
     """
     known = np.isfinite(legs).all(axis=1)
-    if known.sum() < TURN:
+    if known.sum() < _per_mean(period):
         return ""
-    legs, gravity = (_in_turns(each[known]) for each in (legs, gravity))
+    legs, gravity = (_in_turns(each[known], period) for each in (legs, gravity))
     for name, axis in (("pitched", 0), ("rolled", 1)):
         by_legs, by_gravity, difference = (float(np.ptp(each[:, axis])) for each in (legs, gravity, legs - gravity))
         if max(by_legs, by_gravity) > TILTS and difference > MISSED * max(by_legs, by_gravity):
@@ -211,7 +217,7 @@ class States:
             return
         gravity = np.array([each.gravity for each in self._rise])
         if fault := wrong_imu(self._rise, contract.period) or (
-            at_odds(np.array(self._down), gravity) if self._legs else ""
+            at_odds(np.array(self._down), gravity, contract.period) if self._legs else ""
         ):
             self._tell(f"{WALK} is refused: {fault}; look at how the IMU's axes are mounted and read")
             return
@@ -224,7 +230,7 @@ class States:
         In the second half a robot with three feet or more rolls to both sides, so that the IMU check measures a roll.
         """
         contract = self.controller.contract
-        if len(self._rise) < KEPT:
+        if len(self._rise) * contract.period < KEPT:
             self._rise.append(replace(measured, **{name: np.array(getattr(measured, name)) for name in _IMU}))
             if self._legs:
                 self._down.append(self._legs.down(measured))
