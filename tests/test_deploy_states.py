@@ -26,6 +26,7 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import DriveInput, Gamepad, Keys, RobotRemote, StopFile, from_sticks
 from legged_mw.deploy.log import read_log
 from legged_mw.deploy.robot import Health, Measurement, Remote
+from legged_mw.deploy.runner import run
 from legged_mw.deploy.states import KEPT, STANDS, STEEP, States, at_odds, wrong_imu
 
 POLICIES = ROOT / "resources/policies"
@@ -236,6 +237,33 @@ def test_one_who_drives_goes_before_the_others(contract: Contract) -> None:
     assert command(Remote(), "\x1b[A") == [0.3, 0.0, 0.0]
     assert command(Remote(ly=0.5)) == [0.75, 0.0, 0.0]
     assert command(Remote()) == [0.1, 0.1, 0.1]
+    os.close(write)
+    os.close(read)
+
+
+def test_a_command_by_keys_ends_with_the_policy(contract: Contract) -> None:
+    """Ahead, a stop; what is pressed while it lies does not count either: the next policy begins at rest."""
+    read, write = os.pipe()
+    typed = {5: "s", 230: "a", 240: 2 * "\x1b[A", 243: "x", 260: 5 * "\x1b[B", 300: "s", 305: "s", 540: "a"}
+
+    class Typist(Keys):
+        step = -1
+
+        def poll(self, health: Health) -> DriveInput:
+            self.step += 1
+            os.write(write, typed.get(self.step, "").encode())
+            return super().poll(health)
+
+    robot, commands = Watched(GO1, contract, whole=True), dict[str, list[list[float]]]()
+    keys, controller = Typist(contract.commands, read), Controller(GO1, contract)
+    states = States(controller, [keys], lambda _: np.zeros(3))
+
+    def watch(_now: float, _measured: Measurement | None) -> None:
+        commands.setdefault(f"{states.state} from {states.since:.2f}", []).append(states.command.tolist())
+
+    run(robot, controller, lambda _: np.zeros(0), 11.2, live=False, watch=watch, states=states)
+    (first, second) = (each for name, each in commands.items() if name.startswith("policy"))
+    assert first[-1] == [0.6, 0.0, 0.0] and second == [[0.0, 0.0, 0.0]] * 20
     os.close(write)
     os.close(read)
 

@@ -45,7 +45,7 @@ class InputSource(Protocol):
         ...
 
     def let_go(self) -> None:
-        """Clear this source's command, because another source drives now."""
+        """Clear this source's command, because another source drives now, or the policy ended."""
 
     def close(self) -> None:
         """Release the terminal and close files. Safe to call twice."""

@@ -245,6 +245,9 @@ class States:
 
     def _enter(self, state: str, now: float, note: str) -> None:
         self.state, self.since = state, now
+        if state != POLICY:  # what keys asked for before a stop must not move the robot after it
+            for source in self.sources:
+                source.let_go()
         self._tell(note)
 
     def _tell(self, note: str) -> None:
