@@ -20,6 +20,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zlib
 from collections import deque
@@ -373,8 +374,8 @@ class WireGuard:
             self.tripped, self._moving = why, False
             done = f"{why}; the joints are damped" if self._command else why
             self.board.put(self._looked, text=done)
-            with contextlib.suppress(OSError):  # the terminal is closed
-                print(f"guard: {done}", file=sys.stderr, flush=True)
+            # on a thread: a terminal that is paused (Ctrl-S) must not stop the damping
+            threading.Thread(target=_say, args=(f"guard: {done}",), daemon=True).start()
 
     def _report(self) -> str:
         lines = [f"{self.wire.dropped} states of another size dropped"] if getattr(self.wire, "dropped", 0) else []
@@ -395,6 +396,11 @@ KEPT = {
     getattr(signal, f"SIG{name}")
     for name in ("KILL", "STOP", "CHLD", "CONT", "URG", "WINCH", "PIPE", "SEGV", "BUS", "FPE", "ILL")
 }
+
+
+def _say(line: str) -> None:
+    with contextlib.suppress(OSError):  # the terminal is closed
+        print(line, file=sys.stderr, flush=True)
 
 
 def _name(number: int) -> str:
