@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shlex
@@ -28,7 +29,7 @@ from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.faults import Faults, parse_faults
 from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.handset import Handset
-from legged_mw.unitree.link import Received, RobotEnd
+from legged_mw.unitree.link import STAND_DOWN, Received, RobotEnd
 from legged_mw.unitree.remote import encode
 from legged_mw.unitree.serve import DAMPED, LOW_LEVEL, STEP, SimulatedUnitree
 from tests.wires import POLICIES
@@ -391,6 +392,20 @@ def second(domain: int, sim: SimulatedUnitree) -> str:
     thread.start()
     live(sim, lambda: not thread.is_alive())
     return said[0]
+
+
+def test_a_robot_keeps_its_own_program_if_the_policy_ended_before(domain: int) -> None:
+    """Ctrl-C while the guard waits for a robot, which is switched on then: nobody lets it fall."""
+    sim, (here, there) = served(domain), socket.socketpair()
+    with tempfile.TemporaryFile() as file, there:
+        file.truncate(1 << 16)
+        settings = {"package": "unitree_go", "interface": "lo", "domain": domain, "late": 0.06, "still": 0.04}
+        settings |= {"find": 60.0, "lies_down": True, "channel": there.fileno(), "board": file.fileno()}
+        command = [sys.executable, "-c", f"from {guard.__name__} import main; main()", json.dumps(settings)]
+        process = subprocess.Popen(command, pass_fds=(there.fileno(), file.fileno()), start_new_session=True)
+    here.close()
+    live(sim, lambda: process.poll() is not None)
+    assert process.returncode == 0 and sim.end.program == "normal" and not {STAND_DOWN} & {*sim.end.calls}
 
 
 LATE = "no targets for [0-9]+ ms: the policy's process hangs or is late; the joints are damped"

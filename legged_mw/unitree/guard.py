@@ -94,6 +94,15 @@ class Board:
         return self._posted
 
 
+def _closed(channel: socket.socket) -> bool:
+    """True if the other end of ``channel`` is closed."""
+    if channel.fileno() < 0:
+        return True
+    with contextlib.suppress(OSError):
+        return bool(select.select([channel], [], [], 0.0)[0]) and not channel.recv(1, socket.MSG_PEEK)
+    return True
+
+
 # ---- the policy's side ---------------------------------------------------------------------------------------------
 
 
@@ -230,11 +239,7 @@ class Guarded:
 
     def _ended(self) -> bool:
         """True if the guard's end of the channel is closed."""
-        if self._channel.fileno() < 0:
-            return True
-        with contextlib.suppress(OSError):
-            return bool(select.select([self._channel], [], [], 0.0)[0]) and not self._channel.recv(1, socket.MSG_PEEK)
-        return True
+        return _closed(self._channel)
 
     def _damp_instead(self, why: str) -> None:
         """Send damping from this process from now on. A guard that still runs also damps, see ``WireGuard.turn``."""
@@ -413,13 +418,21 @@ def main() -> None:
     settings = json.loads(sys.argv[1])
     channel = socket.socket(fileno=settings["channel"])
     real_time(PRIORITY, heirs=True)  # before DDS starts its threads
+
+    def wait() -> None:
+        """Wait a moment. Raises RobotError if the policy's process ended: then the robot keeps its own program."""
+        time.sleep(0.001)
+        if _closed(channel):
+            raise RobotError("the policy's process ended")
+
     try:
         # the previous guard may still damp
         claimed = claim(settings["interface"], settings["domain"], 2 * AFTER)
-        wire = Wire(settings["package"], settings["interface"], settings["domain"])
+        wire = Wire(settings["package"], settings["interface"], settings["domain"], wait)
         first = wire.prepare(settings["find"], lies_down=settings["lies_down"])
     except RobotError as error:
-        channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
+        with contextlib.suppress(OSError):  # the policy's process ended
+            channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
         return
     board = Board(settings["board"], len(first.body))
     board.put(first.stamp, first.body, first.stamp)
