@@ -21,6 +21,7 @@ import pytest
 from drivers import Script, Watched, driven
 
 from legged_mw import ROOT
+from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.inputs import DriveInput, Gamepad, Keys, RobotRemote, StopFile, from_sticks
@@ -28,6 +29,7 @@ from legged_mw.deploy.log import read_log
 from legged_mw.deploy.robot import Health, Measurement, Remote
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.states import KEPT, STANDS, STEEP, States, at_odds, wrong_imu
+from legged_mw.utils.errors import UserError
 
 POLICIES = ROOT / "resources/policies"
 GO1 = POLICIES / "go1_flat"
@@ -329,6 +331,28 @@ def test_a_signal_damps_and_ends(ending: signal.Signals, tmp_path: Path) -> None
         process.send_signal(ending)
         rest = process.stdout.read()
     assert process.returncode == 0 and "the joints are damped; logged to" in rest
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--limit", "tlit=45"],
+        ["--limit", "tilt=4o"],
+        ["--gamepad", "/no/js9"],
+        ["--stop_fd", "999"],
+        ["--log", ""],
+    ],
+)
+def test_no_robot_is_touched_for_a_flag_that_is_wrong(
+    flags: list[str], contract: Contract, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To connect ends the robot's own program, and what stands by it falls."""
+    monkeypatch.setattr(sys, "argv", ["deploy", str(GO1), "--drive", *flags])
+    touched = list[bool]()
+    monkeypatch.setattr(program, "MujocoRobot", lambda *_, **__: touched.append(True))
+    with pytest.raises(UserError):
+        program.main()
+    assert not touched
 
 
 def swapped(one: int, other: int) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -226,13 +227,11 @@ def main() -> None:
     elif args.serve:
         serve(folder, contract, args)
     elif args.robot != "simulated":
-        robot = connect(folder, contract, args)
-        drive.drive(robot, folder, contract, args, command, args.robot, contact)
-        print(robot.report)
+        join = partial(connect, folder, contract, args)
+        print(drive.drive(join, folder, contract, args, command, args.robot, contact).report)
     elif args.drive:
-        robot = MujocoRobot(
-            folder, contract, inside, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args)
-        )
+        hoisted, raised = drive.hoisted(args, contract), drive.lift(args)
+        robot = partial(MujocoRobot, folder, contract, inside, whole=True, hoisted=hoisted, lift=raised)
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
         examine(

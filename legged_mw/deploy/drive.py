@@ -114,33 +114,37 @@ def lift(args: argparse.Namespace) -> float:
 
 
 def drive(
-    robot: Robot,
+    connect: Callable[[], Robot],
     folder: Path,
     contract: Contract,
     args: argparse.Namespace,
     fixed: Sequence[float] | None,
     kind: str,
     contact: str | None = None,
-) -> None:
-    """Drive ``robot`` until Ctrl-C or for ``args.time`` [s], or run its joint check, chirp or first walk.
+) -> Robot:
+    """Drive the robot of ``connect`` until Ctrl-C or for ``args.time`` [s], or run its joint check, chirp or first walk.
 
-    If one of these three finds a fault, the exit code is 1.
+    If one of these three finds a fault, the exit code is 1. ``connect`` may end the robot's own program, which lets
+    the robot fall, so whatever can be refused is refused before it is called. Returns the robot, closed.
     ``fixed`` (C,) is the command while no input source drives; None: the defaults. ``kind`` of robot, for the log.
     ``contact``: the source of foot contact for Odometry; None: no odometry.
     """
     with ExitStack() as stack:
-        stack.callback(robot.close)
+        path = _check(folder, contract, args)
+        controller, exam = Controller(folder, contract), rehearse(folder, contract) if args.first_walk else None
         mirror = stack.enter_context(closing(RobotMonitor(folder, contract, args))) if args.viewer in LIVE else None
+        robot = connect()
+        stack.callback(robot.close)
         limits = Limits.of(folder, contract, robot.limits, parse_limits(args.limit))
         if args.chirp:
             contract, limits = at_rate(contract, limits, robot)
+            controller = Controller(folder, contract)
         safety = Safety(contract, limits)
-        path = None if args.log == "off" else log_path(contract) if args.log is None else writable(args.log, "--log")
         console = stack.enter_context(DriveConsole(contract))
-        controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
+        command = _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
         if args.first_walk:
-            states = FirstWalk(controller, sources, console.say, robot, safety.limits, rehearse(folder, contract))
+            states = FirstWalk(controller, sources, console.say, robot, safety.limits, exam)
         elif args.chirp:
             states = Chirp(controller, sources, console.say, robot, safety.limits)
         elif args.check_joints:
@@ -168,6 +172,17 @@ def drive(
         console.say(f"{summary.timing}\nthe joints are damped{log_note}{states.report}")
     if not states.right:
         raise SystemExit(1)
+    return robot
+
+
+def _check(folder: Path, contract: Contract, args: argparse.Namespace) -> Path | None:
+    """Raise for flags that cannot be followed, before the robot is touched. Returns the path of the log, if any."""
+    Limits.of(folder, contract, asked=parse_limits(args.limit))
+    if args.stop_fd is not None:
+        StopFile(args.stop_fd)
+    if pad := _gamepad(contract, args.gamepad):
+        pad.close()  # opened again later: what is pressed until then must not count
+    return None if args.log == "off" else writable(str(log_path(contract)) if args.log is None else args.log, "--log")
 
 
 def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[InputSource]:
