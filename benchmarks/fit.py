@@ -28,7 +28,7 @@ from legged_mw.deploy.joint_check import HOLD, LIFT, RAMP, REST, SETTLE
 from legged_mw.deploy.loop import real_time
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.unitree import program
+from legged_mw.unitree import driver
 from legged_mw.unitree.handset import Handset, RemoteEvent
 from legged_mw.unitree.link import RobotEnd
 from legged_mw.unitree.robots import machine_of
@@ -112,11 +112,11 @@ class ChangedUnitree(SimulatedUnitree):
 
 def serve(folder: Path, change: Change, domain: int, seconds: float) -> None:
     """Serve the robot on loopback, hanging, before all that is not real time."""
-    real_time(program.PRIORITY, heirs=True)
+    real_time(driver.PRIORITY, heirs=True)
     contract = read_contract(folder)
     end = RobotEnd(machine_of(contract.joints).package, "lo", domain)
     sim = ChangedUnitree(folder, contract, end, change, hoist=True, lift=LIFT)
-    print(program.run(sim, Handset([RemoteEvent(START, ("start",), {}, None)]), seconds).text(), flush=True)
+    print(driver.run(sim, Handset([RemoteEvent(START, ("start",), {}, None)]), seconds).text(), flush=True)
 
 
 def record(folder: Path, change: Change, domain: int, log: Path) -> None:
@@ -127,7 +127,7 @@ def record(folder: Path, change: Change, domain: int, log: Path) -> None:
     robot.start()
     asked = ["--robot", "unitree", "--interface", "lo", "--domain", str(domain), "--chirp", "--log", str(log)]
     drive = [sys.executable, "-m", "legged_mw.deploy", str(folder), *asked, "--time", f"{seconds:.0f}"]
-    subprocess.run(drive, preexec_fn=lambda: real_time(program.PRIORITY, heirs=True))
+    subprocess.run(drive, preexec_fn=lambda: real_time(driver.PRIORITY, heirs=True))
     robot.terminate()
     robot.join()
 

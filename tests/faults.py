@@ -23,11 +23,10 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import States
 from legged_mw.unitree.client import UnitreeRobot
-from legged_mw.unitree.codec import WireMessage
+from legged_mw.unitree.codec import WireMessage, encode_remote
 from legged_mw.unitree.faults import Faults, parse_faults
 from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.link import RobotEnd, Wire
-from legged_mw.unitree.remote import encode
 from legged_mw.unitree.serve import STEP, ServedRecord, SimulatedUnitree
 
 ALONE = 0.22  # [s] of 12 measurements, in which a part that is frozen alone can be known
@@ -74,7 +73,7 @@ class Side:
             self._begun = now
         since = now - self._begun if self._begun is not None else -1.0
         button = "start" if 0.0 < since < 0.05 else "A" if since > 0.1 and since % 0.08 < 0.04 else ""
-        sim.remote = encode(([button] if button else []) if self.held is None else self.held)
+        sim.remote = encode_remote(([button] if button else []) if self.held is None else self.held)
         begins = self.case.from_start or (self.walking is not None and now > self.walking + WALK)
         if self.case.robot and self.injected is None and begins:
             self.injected = now
@@ -258,7 +257,7 @@ def lockstep(case: Case, sim: SimulatedUnitree, wire: Wire, folder: Path, patch:
     """Run one fault; the robot's record and what was said are in what comes back. ``patch``: pytest's monkeypatch."""
     for name, value in () if case.from_start else (("RISE", RISE), ("STANDS", 1.0)):
         patch.setattr(f"legged_mw.deploy.states.{name}", value)
-    sim.faults, sim.record, sim.remote, sim._rng = Faults(), ServedRecord(), encode(), np.random.default_rng(0)
+    sim.faults, sim.record, sim.remote, sim._rng = Faults(), ServedRecord(), encode_remote(), np.random.default_rng(0)
     sim.reset(after=1.0)
     while wire.receive() or wire.other_commander() or sim.end.receive():  # of the fault before
         pass

@@ -24,13 +24,12 @@ import pytest
 
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import RobotError
-from legged_mw.unitree import client, clock, guard, link, program
-from legged_mw.unitree.codec import LAYOUTS, WireMessage
+from legged_mw.unitree import client, clock, driver, guard, link
+from legged_mw.unitree.codec import LAYOUTS, WireMessage, encode_remote
 from legged_mw.unitree.faults import Faults, parse_faults
 from legged_mw.unitree.guard import Board, Guarded, WireGuard
 from legged_mw.unitree.handset import Handset
 from legged_mw.unitree.link import STAND_DOWN, Received, RobotEnd
-from legged_mw.unitree.remote import encode
 from legged_mw.unitree.serve import DAMPED, LOW_LEVEL, STEP, SimulatedUnitree
 from tests.wires import POLICIES
 from tests.wires import domain as domain
@@ -584,7 +583,7 @@ def test_the_program_with_motors_in_another_order(domain: int) -> None:
     }
     with subprocess.Popen(deploy(domain, "--time", "1s"), **where) as policy:
         live(sim, lambda: sim.record.commands > 50)
-        sim.remote = encode(["start"])
+        sim.remote = encode_remote(["start"])
         live(sim, lambda: policy.poll() is not None)
         said, errors = policy.communicate()
     assert policy.returncode == 0, errors
@@ -603,7 +602,7 @@ def test_a_served_robot_says_why_it_refuses(domain: int, capsys: pytest.CaptureF
     command["motor_cmd.q"] = np.nan
     bodies += [command.seal()] * 2
     sim.end.receive = iter([*bodies, *[None] * 100]).__next__  # type: ignore[method-assign]
-    done = program.run(sim, Handset(), 0.04)
+    done = driver.run(sim, Handset(), 0.04)
     refused = [line for line in capsys.readouterr().out.splitlines() if line.startswith("refused: ")]
     assert done.record.refused == len(bodies) and len(refused) == 4
     for line, word in zip(refused, ["level_flag (0, 0, 0)", "807 bytes", "checksum", "q is not finite"], strict=True):
@@ -615,7 +614,7 @@ def test_a_served_robot_tells_what_its_faults_led_to(domain: int, capsys: pytest
     zeros, kp = np.zeros(12), np.full(12, 1.0)
     sim._obey({"q": sim.joint_pos, "dq": zeros, "tau": zeros, "kp": kp, "kd": zeros})
     sim.record.changes.append((0.065, DAMPED))
-    done = program.run(sim, Handset(), 0.04, faults)
+    done = driver.run(sim, Handset(), 0.04, faults)
     assert sim.faults == Faults(temperature=95.0, silent=True) and len(done.faults) == 2
     assert (
         "hot_motor@0.02: its motors damped 45 ms later, and nothing drove them again\nsilent@0.02: its motors"

@@ -19,9 +19,8 @@ from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import BUTTONS
 from legged_mw.unitree import handset, idl, link
-from legged_mw.unitree.codec import LAYOUTS, STRUCTS, WireMessage, crc32, fields
+from legged_mw.unitree.codec import LAYOUTS, STRUCTS, WireMessage, crc32, decode_remote, encode_remote, fields
 from legged_mw.unitree.faults import KINDS, Faults, parse_faults
-from legged_mw.unitree.remote import decode, encode
 from legged_mw.unitree.robots import G1, GO2, H1, check_body, machine_of, order
 from legged_mw.utils.cli import one_line_errors
 from tests.wires import POLICIES
@@ -182,18 +181,18 @@ def test_the_contracts_body_passes_and_other_machines_have_no_choice() -> None:
 
 
 def test_the_remote() -> None:
-    data = encode(["A", "L2"], lx=0.25, ly=0.5, rx=-1.0, ry=0.125)
+    data = encode_remote(["A", "L2"], lx=0.25, ly=0.5, rx=-1.0, ry=0.125)
     assert len(data) == 40 and data[2:4] == (1 << 8 | 1 << 5).to_bytes(2, "little")
     assert np.frombuffer(data, "<f4", offset=4)[[0, 1, 2, 4]].tolist() == [0.25, -1.0, 0.125, 0.5]
-    remote = decode(data)
+    remote = decode_remote(data)
     assert (
         remote
         and remote.buttons == {"A", "L2"}
         and (remote.lx, remote.ly, remote.rx, remote.ry) == (0.25, 0.5, -1.0, 0.125)
     )
-    assert decode(bytes(40)) is None
+    assert decode_remote(bytes(40)) is None
     for i, name in enumerate(BUTTONS):
-        assert encode([name])[2:4] == (1 << i).to_bytes(2, "little")
+        assert encode_remote([name])[2:4] == (1 << i).to_bytes(2, "little")
 
 
 def test_a_script_of_the_remote(tmp_path: Path) -> None:
@@ -201,7 +200,7 @@ def test_a_script_of_the_remote(tmp_path: Path) -> None:
         "remote: [{time: 2, ly: 0.5}, {time: 1, press: start}, {time: 3, lx: -1, hoist: false}]"
     )
     hand = handset.Handset(handset.load_remote(tmp_path / "remote.yaml"))
-    states = [decode(hand.state(time)) for time in (0.0, 1.0, 1.09, 1.2, 2.5, 3.0)]
+    states = [decode_remote(hand.state(time)) for time in (0.0, 1.0, 1.09, 1.2, 2.5, 3.0)]
     assert [(set(s.buttons), s.ly, s.lx) for s in states if s] == [
         *((set(), 0, 0), ({"start"}, 0, 0), ({"start"}, 0, 0), (set(), 0, 0), (set(), 0.5, 0), (set(), 0.5, -1))
     ]

@@ -18,9 +18,9 @@ import pytest
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.robot import Floats
+from legged_mw.deploy.robot import Floats, RobotError
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.unitree.client import Direct, UnitreeRobot
+from legged_mw.unitree.client import UnitreeRobot
 from legged_mw.unitree.link import LEASE, Received, RobotEnd, Wire
 from legged_mw.unitree.robots import machine_of
 from legged_mw.unitree.serve import STEP, SimulatedUnitree
@@ -79,6 +79,30 @@ class Owner:
 
     def close(self, last: bytes) -> str:
         self.sent.append(last)
+        return ""
+
+
+class Direct:
+    """A wire in this process, without a guard, for tests in lockstep."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+
+    def receive(self) -> Received | None:
+        if self.wire.other_commander():
+            raise RobotError("another program sends commands to this robot, too")
+        if why := self.wire.another_robot():
+            raise RobotError(why)
+        return self.wire.receive()
+
+    def arm(self, damping: bytes) -> None: ...
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        self.wire.send(body)
+
+    def close(self, last: bytes) -> str:
+        for _ in range(5):
+            self.wire.send(last)
         return ""
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,8 @@ from legged_mw.deploy.contract import ATTITUDE, COMPUTED, CONTRACT_FILE, PLACE, 
 from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.unitree import clock, need_dds
-from legged_mw.unitree.codec import LAYOUTS, WireMessage
-from legged_mw.unitree.remote import decode
+from legged_mw.unitree import clock, guard, need_dds
+from legged_mw.unitree.codec import LAYOUTS, WireMessage, decode_remote
 from legged_mw.unitree.robots import Machine, check_body, check_slots, machine_of, order
 
 TOO_OLD = 0.1  # [s] ours: an older measurement is not used
@@ -27,47 +26,6 @@ TOUCH = 20  # foot_force of a foot on the ground, in the robot's own unit; ours
 _WRAP = 2**32 / 1000  # [s] after which a robot's tick wraps to 0
 LOST = 5  # ours: messages that a motor may lose between two checks
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
-
-
-class Owner(Protocol):
-    """The owner of the wire: this process (``Direct``) or the guard process (``guard.Guarded``)."""
-
-    def receive(self) -> Any:
-        """The newest state with its stamp; None if no state arrived since the last call."""
-
-    def arm(self, damping: bytes) -> None:
-        """Give the owner the command that damps this robot, to be sent if this process fails."""
-
-    def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        """Send a command computed from the state of ``stamp`` [s]. ``safe``: it may be repeated forever."""
-
-    def close(self, last: bytes) -> str:
-        """Send ``last`` for a while and close. Returns a report of latencies, or an empty string."""
-        ...
-
-
-class Direct:
-    """A wire in this process, without a guard, for tests."""
-
-    def __init__(self, wire: Any) -> None:
-        self.wire = wire
-
-    def receive(self) -> Any:
-        if self.wire.other_commander():
-            raise RobotError("another program sends commands to this robot, too")
-        if why := self.wire.another_robot():
-            raise RobotError(why)
-        return self.wire.receive()
-
-    def arm(self, damping: bytes) -> None: ...
-
-    def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        self.wire.send(body)
-
-    def close(self, last: bytes) -> str:
-        for _ in range(5):
-            self.wire.send(last)
-        return ""
 
 
 class UnitreeRobot(Robot):
@@ -81,14 +39,14 @@ class UnitreeRobot(Robot):
     def __init__(
         self,
         contract: Contract,
-        owner: Owner,
+        owner: guard.Guarded,
         first: Any,
         *,
         simulated: bool = False,
         odometry: bool = False,
         clock: Callable[[], float] = clock,
     ) -> None:
-        """``first``: the robot's last state. ``odometry``: the velocity is estimated from the measurements.
+        """``owner`` of the wire. ``first``: the robot's last state. ``odometry``: measurements give the velocity.
 
         ``simulated``: each command has the tick of the state that it answers. If the first state has no checksum or no
         voltage, later states need none.
@@ -196,7 +154,7 @@ class UnitreeRobot(Robot):
             age_s=self._clock() - self._stamp,
             temperatures=temperatures.astype(float),
             voltage=self._voltage if self._metered else None,
-            remote=decode(state["wireless_remote"].tobytes()),
+            remote=decode_remote(state["wireless_remote"].tobytes()),
             motor_faults=faults,
         )
 
@@ -269,15 +227,14 @@ def connect(
 ) -> UnitreeRobot:
     """Connect to the robot on a network interface; a guard process owns the wire. Raises RobotError with the reason."""
     need_dds()
-    from legged_mw.unitree.guard import LATE, Guarded
     from legged_mw.unitree.link import LOOPBACK, default_domain
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine, odometry)
     read_scene(folder, contract)  # before anything is sent, raise for a scene that does not fit the contract
     domain = default_domain(interface) if domain is None else domain
-    late = max(LATE, 1.5 * contract.period)  # allow for a slow policy
-    owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)
+    late = max(guard.LATE, 1.5 * contract.period)  # allow for a slow policy
+    owner = guard.Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)
     try:
         return UnitreeRobot(contract, owner, owner.first, simulated=interface in LOOPBACK, odometry=odometry)
     except BaseException:

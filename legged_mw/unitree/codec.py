@@ -1,4 +1,4 @@
-"""Unitree's low-level messages as bytes: fields, their offsets on the wire, and the checksum. It does not use DDS.
+"""Unitree's low-level messages as bytes: fields, their offsets, the checksum, the remote's part. It does not use DDS.
 
 Names, order and widths of the fields follow Unitree's published unitree_sdk2: ``unitree_go`` (Go2, B2, H1),
 ``unitree_hg`` (G1, H1-2), ``unitree_api`` (the motion service). "byte" means IDL's octet; Unitree's Python says uint8.
@@ -7,11 +7,15 @@ Names, order and widths of the fields follow Unitree's published unitree_sdk2: `
 from __future__ import annotations
 
 import re
+import struct
 import zlib
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from legged_mw.deploy.robot import BUTTONS, Remote
 
 _IMU = "quaternion float32[4], gyroscope float32[3], accelerometer float32[3], rpy float32[3], temperature "
 _MOTOR = "mode byte, q float32, dq float32, tau float32, kp float32, kd float32, reserve "
@@ -54,6 +58,8 @@ STRUCTS: dict[str, dict[str, str]] = {
 }
 _DTYPES = {"byte": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4"}
 HEADER = b"\x00\x01\x00\x00"  # of every sample: plain CDR (XCDR1), little-endian
+_REMOTE = struct.Struct("<2sHfffff16x")  # of wireless_remote: head, buttons from bit 0, lx, rx, ry, L2, ly
+_REMOTE_HEAD = b"\x55\x51"
 _MIRRORED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))  # each byte with its bits reversed
 
 
@@ -166,3 +172,18 @@ def crc32(image: NDArray[np.uint8]) -> int:
     words = image.view("<u4").byteswap().tobytes()
     result = zlib.crc32(words.translate(_MIRRORED)) ^ 0xFFFFFFFF
     return int.from_bytes(result.to_bytes(4, "little").translate(_MIRRORED), "big")
+
+
+def decode_remote(data: bytes) -> Remote | None:
+    """Buttons and sticks of ``wireless_remote``; None for 40 zeros, when no remote is on."""
+    if not any(data):
+        return None
+    _, bits, lx, rx, ry, _, ly = _REMOTE.unpack(data)
+    return Remote(frozenset(name for i, name in enumerate(BUTTONS) if bits >> i & 1), lx=lx, ly=ly, rx=rx, ry=ry)
+
+
+def encode_remote(
+    buttons: Iterable[str] = (), lx: float = 0.0, ly: float = 0.0, rx: float = 0.0, ry: float = 0.0
+) -> bytes:
+    """The 40 bytes of a remote that is on."""
+    return _REMOTE.pack(_REMOTE_HEAD, sum(1 << BUTTONS.index(name) for name in buttons), lx, rx, ry, 0.0, ly)

@@ -107,7 +107,7 @@ def _closed(channel: socket.socket) -> bool:
 
 
 class Guarded:
-    """The policy process's side of the wire, through a guard (see ``client.Owner``).
+    """The policy process's side of the wire, through a guard.
 
     If the guard ends, or is silent while the robot moves, this process sends damping instead, until the end.
     """
@@ -189,6 +189,7 @@ class Guarded:
         return owner
 
     def receive(self) -> Any:
+        """The newest state with its stamp; None if no state arrived since the last call. Raises RobotError."""
         from legged_mw.unitree.link import Received
 
         now = self._clock()  # before reading the board, so that a pause here does not count as the guard's
@@ -207,10 +208,12 @@ class Guarded:
         return Received(body, stamp)
 
     def arm(self, damping: bytes) -> None:
+        """Store the command that damps this robot, to be sent if this process fails."""
         self._damping = damping
         self._put(ARM, 0.0, damping)
 
     def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        """Send a command computed from the state of ``stamp`` [s]. ``safe``: it may be repeated forever."""
         if not self._instead:
             self._moving = not safe
             self._put(SAFE if safe else MOVE, stamp, body)
@@ -218,7 +221,7 @@ class Guarded:
             self._commander.send(self._damping)
 
     def close(self, last: bytes) -> str:
-        """Returns the guard's report of latencies. Without its answer, why this process damped."""
+        """Send ``last`` for a while and close. Returns the guard's report of latencies, or why this process damped."""
         answer: dict[str, Any] = {}
         if sends_last := bool(last) and not self._instead and self._channel.fileno() >= 0:
             self._put(CLOSE, 0.0, last)

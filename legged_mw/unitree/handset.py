@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from legged_mw.deploy.robot import BUTTONS
-from legged_mw.unitree.remote import encode
+from legged_mw.unitree.codec import encode_remote
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 
@@ -112,7 +112,7 @@ class Handset:
                 self._key(key, time)
         if self.off:
             return bytes(40)
-        return encode(self._buttons if time < self._until else (), **self._sticks)
+        return encode_remote(self._buttons if time < self._until else (), **self._sticks)
 
     def _press(self, buttons: tuple[str, ...], time: float) -> None:
         self._buttons, self._until = buttons, time + HELD

@@ -21,9 +21,8 @@ from legged_mw.deploy.robot import Floats, damped
 from legged_mw.deploy.safety import limits_of
 from legged_mw.deploy.simulated import read_scene, trunk_of
 from legged_mw.unitree.client import STEP
-from legged_mw.unitree.codec import LAYOUTS, WireMessage
+from legged_mw.unitree.codec import LAYOUTS, WireMessage, encode_remote
 from legged_mw.unitree.faults import NAN, SWAPS, Faults, Line
-from legged_mw.unitree.remote import encode
 from legged_mw.unitree.robots import Machine, machine_of, order
 
 # in q and dq: no position control, no velocity control [unitree_sdk2]
@@ -109,7 +108,7 @@ class SimulatedUnitree:
         self.model, self._rng = self._scene.model, np.random.default_rng(seed)
         self._limits = limits_of(self.model, contract)
         self._make_motors()
-        self.data, self.remote = mujoco.MjData(self.model), encode()
+        self.data, self.remote = mujoco.MjData(self.model), encode_remote()
         self._slots, self._state = (
             order(self.machine, contract.joints),
             WireMessage(LAYOUTS[self.machine.package, "LowState_"]),

@@ -18,9 +18,8 @@ import pytest
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import QUANTITIES, Floats, Health, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits, Safety
-from legged_mw.unitree import remote
 from legged_mw.unitree.client import UnitreeRobot
-from legged_mw.unitree.codec import LAYOUTS, WireMessage
+from legged_mw.unitree.codec import LAYOUTS, WireMessage, decode_remote
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.serve import SimulatedUnitree
 from legged_mw.view.web import Gate, is_local
@@ -464,7 +463,7 @@ def served() -> SimulatedUnitree:
 
 @pytest.mark.parametrize("data", [b"\xff" * 40, b"\x55\x51" + b"\xff" * 38, b"\x00" * 39 + b"\x01"])
 def test_noise_of_a_remote_walks_nowhere(data: bytes) -> None:
-    held = remote.decode(data)
+    held = decode_remote(data)
     assert held is not None and not any(abs(getattr(held, stick)) > 1e-6 for stick in ("lx", "ly", "rx", "ry"))
 
 

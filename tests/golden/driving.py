@@ -30,7 +30,7 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.unitree import link, need_dds
-from legged_mw.unitree.client import Direct, UnitreeRobot, check_rows
+from legged_mw.unitree.client import UnitreeRobot, check_rows
 from legged_mw.unitree.codec import LAYOUTS, WireMessage
 from legged_mw.unitree.link import Received, Wire
 from legged_mw.unitree.robots import G1, GO2, check_body, machine_of
@@ -210,7 +210,6 @@ def table() -> Table:
             "wire: a clock that goes back": lambda: after(state(tick=1000).seal()),
             "wire: another body": another_body,
             "wire: targets of NaN": lambda: robot().write(np.full(12, np.nan)),
-            "wire: another commander": lambda: Direct(SimpleNamespace(other_commander=lambda: True)).receive(),
             "wire: no robot": lambda: wired(receive=lambda: None, _nobody=lambda seconds: "no robot").prepare(),
             "wire: taken": lambda: wired(
                 receive=lambda: 1, _release=lambda _: None, other_commander=lambda: True
