@@ -19,11 +19,11 @@ from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.hard_exam import apply_conditions, look
-from legged_mw.deploy.simulated import lowest_point
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.user_scene import fit, torque_limits
 from legged_mw.eval import hard, walking
 from legged_mw.utils.errors import UserError
+from legged_mw.view.posed_robot import lowest_point
 
 GO2 = ROOT / "resources/policies/go2_flat"
 NAMES = [condition.name for condition in hard.CONDITIONS]
@@ -113,7 +113,7 @@ def test_joints_without_a_limit_get_the_exports(tmp_path: Path) -> None:
         calf.attrib |= {"actuatorfrcrange": "-90 90", "actuatorfrclimited": "true"}
 
     contract = read_contract(GO2)
-    model = fit(vendors(tmp_path, without_motors), GO2, contract, lowest_point)[0].compile()
+    model = fit(vendors(tmp_path, without_motors), GO2, contract)[0].compile()
     own = mujoco.MjModel.from_xml_path(str(GO2 / "scene.xml"))
     found, exported = (torque_limits(each, [each.joint(name).id for name in contract.joints]) for each in (model, own))
     calf = contract.joints.index("FL_calf_joint")
@@ -143,7 +143,7 @@ def test_a_scene_without_a_ground_gets_one(tmp_path: Path) -> None:
             for geom in world.findall("geom"):
                 world.remove(geom)
 
-    spec, _ = fit(vendors(tmp_path, bare), GO2, read_contract(GO2), lowest_point)
+    spec, _ = fit(vendors(tmp_path, bare), GO2, read_contract(GO2))
     model = spec.compile()
     assert [model.geom(i).type[0] for i in np.flatnonzero(model.geom_bodyid == 0)] == [mujoco.mjtGeom.mjGEOM_PLANE]
     data = mujoco.MjData(model)
@@ -214,16 +214,16 @@ NO_SCENES = {
 @pytest.mark.parametrize("change", WRONG.values(), ids=WRONG)
 def test_a_scene_that_does_not_fit(change: Change, tmp_path: Path) -> None:
     with pytest.raises(UserError):
-        fit(vendors(tmp_path, change), GO2, read_contract(GO2), lowest_point)
+        fit(vendors(tmp_path, change), GO2, read_contract(GO2))
 
 
 def test_what_is_no_scene(tmp_path: Path) -> None:
     for file in (tmp_path, tmp_path / "none.xml"):
         with pytest.raises(UserError):
-            fit(file, GO2, read_contract(GO2), lowest_point)
+            fit(file, GO2, read_contract(GO2))
     os.mkfifo(tmp_path / "pipe.xml")
     with pytest.raises(UserError):
-        fit(tmp_path / "pipe.xml", GO2, read_contract(GO2), lowest_point)
+        fit(tmp_path / "pipe.xml", GO2, read_contract(GO2))
 
 
 def test_from_the_command_line(

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.robot import Floats, Measurement
-from legged_mw.deploy.simulated import Fleet, lowest_point, trunk_of
+from legged_mw.deploy.simulated import Fleet, trunk_of
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.user_scene import torque_limits
 from legged_mw.eval import hard
 from legged_mw.eval.hard import CONDITIONS, NOISE, Walk
 from legged_mw.eval.walking import GRAVITY, ExamRules
 from legged_mw.utils.commands import VELOCITY
+from legged_mw.view.posed_robot import lowest_point
 
 LOOK_SECONDS = 10.0  # [s] duration of the gait measurement, with the settling time
 PICTURES, WIDTH, HEIGHT = 6, 240, 260  # number of pictures of one stride; [px] size of each

@@ -41,6 +41,7 @@ from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
 from legged_mw.utils.motor_network import DC_DAMPING, DC_STIFFNESS
+from legged_mw.view.posed_robot import lowest_point
 
 # ---- pose from measurements -----------------------------------------------------------------------------------------
 
@@ -67,21 +68,6 @@ def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity:
 def trunk_of(model: mujoco.MjModel) -> int:
     """The heaviest body: the trunk of a quadruped, the torso of a humanoid."""
     return int(np.argmax(model.body_mass))
-
-
-def lowest_point(model: Any, data: Any, geom: int) -> float:
-    """Height [m] of the lowest point of ``geom``: exact for a sphere or capsule, else of its bounding box."""
-    return float(data.geom_xpos[geom, 2]) - _reach(model, geom, data.geom_xmat[geom])
-
-
-def _reach(model: Any, geom: int, turn: Floats) -> float:
-    """Height [m] of the centre above the lowest point: exact for a sphere or capsule, else of its bounding box."""
-    kind, size = model.geom_type[geom], model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return size[0] + abs(turn[8]) * size[1]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        return size[0]
-    return float(np.abs(turn[6:]) @ model.geom_aabb[geom, 3:] - turn[6:] @ model.geom_aabb[geom, :3])
 
 
 Change = Callable[[mujoco.MjModel], None]
@@ -426,7 +412,7 @@ def enter_scene(folder: Path, contract: Contract, file: str | Path, whole: bool)
     """The scene, and the contract for it. Raises ContractError, and UserError for a user's scene that does not fit."""
     if isinstance(file, str):
         return read_scene(folder, contract, file, whole), contract
-    spec, contract = fit(file, folder, contract, lowest_point)
+    spec, contract = fit(file, folder, contract)
     return _find_all(spec, spec.compile(), file.name, contract), contract
 
 

@@ -9,7 +9,7 @@ Masses, contacts, joint friction, solver and time step stay. The file is not tru
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,17 @@ from legged_mw.deploy.contract import SCENE_FILE, Contract, compile_scene, part
 from legged_mw.deploy.robot import Floats
 from legged_mw.robot.mjcf import XmlSource, check_model
 from legged_mw.utils.errors import UserError, unknown
+from legged_mw.view.posed_robot import lowest_point
 
 HOME = "home"  # keyframe with the start pose
 _LOW = 0.01  # [m] a geom of the foot's body belongs to the foot if it ends this close to the lowest point
 _OBJECT, _SENSOR = mujoco.mjtObj, mujoco.mjtSensor
-Lowest = Callable[[mujoco.MjModel, mujoco.MjData, int], float]
 
 
-def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[mujoco.MjSpec, Contract]:
+def fit(file: Path, folder: Path, contract: Contract) -> tuple[mujoco.MjSpec, Contract]:
     """The scene in ``file`` for the export in ``folder``, and the contract with its time step, mass, sensors and feet.
 
-    ``lowest`` returns the height of a geom's lowest point [m]. Raises UserError.
+    Raises UserError.
     """
     if not file.is_file():
         raise UserError(f"--scene: no file {file}")
@@ -49,8 +49,8 @@ def fit(file: Path, folder: Path, contract: Contract, lowest: Lowest) -> tuple[m
         own = compile_scene(part(folder, SCENE_FILE))
         _make_ready(spec, contract, _missing_limits(spec, own, contract, file_limits) | file_limits)
         imu = _find_imu(spec, own, contract)
-        _stand(spec, contract, lowest)
-        feet = _find_feet(spec, own, contract, lowest)
+        _stand(spec, contract)
+        feet = _find_feet(spec, own, contract)
         sensors = _add_sensors(spec, contract, imu)
         model = spec.compile()
         check_model(model)
@@ -219,12 +219,12 @@ def _find_imu(spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract) -> s
 # ---- start pose, feet, sensors --------------------------------------------------------------------------------------
 
 
-def _stand(spec: mujoco.MjSpec, contract: Contract, lowest: Lowest) -> None:
+def _stand(spec: mujoco.MjSpec, contract: Contract) -> None:
     """Add a keyframe: upright, in the default pose, with the lowest point at height 0."""
     model = spec.compile()
     data = _posed(model, contract)
     touching = np.flatnonzero((model.geom_conaffinity | model.geom_contype > 0) & (model.geom_bodyid > 0)).tolist()
-    data.qpos[2] -= min((lowest(model, data, geom) for geom in touching), default=0.0)
+    data.qpos[2] -= min((lowest_point(model, data, geom) for geom in touching), default=0.0)
     spec.add_key(name=HOME, qpos=data.qpos.tolist(), ctrl=contract.default_pose.tolist())
 
 
@@ -236,9 +236,7 @@ def _posed(model: mujoco.MjModel, contract: Contract) -> mujoco.MjData:
     return data
 
 
-def _find_feet(
-    spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract, lowest: Lowest
-) -> dict[str, tuple[str, ...]]:
+def _find_feet(spec: mujoco.MjSpec, own: mujoco.MjModel, contract: Contract) -> dict[str, tuple[str, ...]]:
     """Foot -> its contact sensors. A foot is the lowest geoms of the bodies that the foot's joint moves."""
     model, feet = spec.compile(), {}
     data = _posed(model, contract)
@@ -251,7 +249,7 @@ def _find_feet(
         geoms = np.flatnonzero((model.body_weldid[model.geom_bodyid] == model.body_weldid[body]) & colliding).tolist()
         if not geoms:
             raise UserError(f"--scene: nothing that '{joint}' moves can touch the ground, so there is no foot {foot}")
-        heights = [lowest(model, data, each) for each in geoms]
+        heights = [lowest_point(model, data, each) for each in geoms]
         low = [each for each, height in zip(geoms, heights, strict=True) if height < min(heights) + _LOW]
         feet[foot] = tuple(_feel(spec, each, f"contact/{foot}/{i}") for i, each in enumerate(low))
     return feet

@@ -285,3 +285,8 @@ def lowest_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Floa
         return (centre + rotation @ (size * towards) / np.linalg.norm(towards))[None]
     box = model.geom_aabb[geom]
     return centre + (box[:3] + CORNERS * box[3:]) @ rotation.T
+
+
+def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Height [m] of a geom's lowest point: of its bounding box, if it is a mesh or a cylinder."""
+    return float(lowest_points(model, data, geom)[:, 2].min())

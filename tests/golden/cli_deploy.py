@@ -10,7 +10,6 @@ from test_user_scene import GO2, NO_SCENES, WRONG, vendors
 from golden.table import Run, Table
 from legged_mw.deploy import safety
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.simulated import lowest_point
 from legged_mw.deploy.user_scene import fit
 from legged_mw.unitree import handset
 from legged_mw.unitree.faults import parse_faults
@@ -197,7 +196,7 @@ def of_scenes(made: Table) -> None:
     }
 
     def fits(of: Contract = contract) -> Run:
-        return lambda root: fit(root / "vendor.xml", GO2, of, lowest_point)
+        return lambda root: fit(root / "vendor.xml", GO2, of)
 
     for name, change in WRONG.items():
         made.add(f"scene: {name}", fits(), lambda root, change=change: vendors(root, change))
