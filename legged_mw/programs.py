@@ -123,6 +123,7 @@ def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
     ``hard``: also the hard exam, if the task walks.
     """
     from legged_mw.deploy.exam import run
+    from legged_mw.deploy.hard_exam import strip_png
     from legged_mw.envs.domain_rand import active
     from legged_mw.eval.report import Column
 
@@ -134,7 +135,8 @@ def grade_export(graded: Graded, hard: bool = True) -> list[Column]:
         try:
             made = Path(folder) / "export"
             export(task, graded.source.checkpoint, made)
-            result, strip = run(made, graded.exam.rules(task), hard)
+            result, poses = run(made, graded.exam.rules(task), hard)
+            strip = strip_png(made, poses)
             return [Column("the same, deployed in MuJoCo", {}, result, strip=strip)]
         except UserError as error:  # a row without sensors, or no onnxruntime
             print(f"not graded through an export: {error}")

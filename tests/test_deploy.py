@@ -432,7 +432,7 @@ def test_results_of_a_shipped_policy_go_to_the_logs(
 ) -> None:
     """The package may be another user's."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
+    monkeypatch.setattr("legged_mw.deploy.exam.run_exam", lambda *_, **__: {})
     monkeypatch.setattr(walking, "table", lambda _: "the table")
     shown = []
     monkeypatch.setattr(program.launch, "watch", lambda stage, args, folder, **_: shown.append(folder.absolute()))
@@ -455,7 +455,7 @@ def test_a_result_that_cannot_be_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Refused before the exam; or after it, where the disk changed meanwhile: the table is out by then."""
-    monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
+    monkeypatch.setattr("legged_mw.deploy.exam.run_exam", lambda *_, **__: {})
     monkeypatch.setattr(walking, "table", lambda _: "the table")
     (tmp_path / "file").write_text("")
     code, out, err = main(capsys, SHIPPED, "--eval", "--no_hard", "--out", tmp_path / "file/exam.json")

@@ -135,7 +135,7 @@ def test_loads() -> None:
 def test_in_the_exam_of_an_export(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(program, "run_exam", lambda *_, **__: exam)
+    monkeypatch.setattr("legged_mw.deploy.exam.run_exam", lambda *_, **__: exam)
     rules = contract_rules(read_contract(GO2))
     exam = {"rules": rules.to_mapping(), "walks": True}
     monkeypatch.setattr(walking, "table", lambda _: "the walking exam")

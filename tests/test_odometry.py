@@ -156,7 +156,9 @@ def test_the_exam_says_how_far_the_estimate_is(
 ) -> None:
     rules = replace(contract_rules(read_contract(GO1)), push_speeds=(2.0,))
     monkeypatch.setattr("legged_mw.eval.walking.EXAM_SECONDS", 3.0)
-    monkeypatch.setattr(program, "run_exam", lambda folder, _, contact, **__: run_exam(folder, rules, contact=contact))
+    monkeypatch.setattr(
+        "legged_mw.deploy.exam.run_exam", lambda folder, _, contact, *__: run_exam(folder, rules, contact)
+    )
     monkeypatch.setattr(
         sys,
         "argv",

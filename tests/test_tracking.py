@@ -269,7 +269,7 @@ def test_an_export_follows_and_is_graded(exported: Path) -> None:
     follower.frame[:] = 21
     stage.step()
     assert follower.frame.tolist() == [21]  # the last one is held
-    result = run_skill(exported, threads=1)
+    result = run_skill(exported)
     assert result["asked"] == {"kind": "tracking"} and {*result["parts"]} == {"not pushed", "pushed"}
 
 

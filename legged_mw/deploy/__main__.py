@@ -12,15 +12,12 @@ from legged_mw import ROOT
 from legged_mw.deploy import drive, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, edits, read_contract
 from legged_mw.deploy.drive import lift
-from legged_mw.deploy.exam import SwitchStage, contract_rules, contract_skill, run_exam, run_skill
-from legged_mw.deploy.hard_exam import run_hard
-from legged_mw.deploy.heat_exam import run_heat
+from legged_mw.deploy.exam import SwitchStage, contract_rules, contract_skill, run
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import heat, walking
-from legged_mw.eval.hard import table
+from legged_mw.eval import walking
 from legged_mw.eval.skills import Skill
 from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
@@ -292,25 +289,13 @@ def examine(
     contract = read_contract(folder, edited)
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
-        if common:
-            raise UserError("--ranges is only for the walking exam: leave it out")
-        if contact:
-            raise UserError("--velocity odometry needs the walking exam, and this policy has another: leave it out")
-        if isinstance(scene, Path):
-            raise UserError("--scene needs the walking exam, and this policy's exam has its own grounds: leave it out")
+        given = {"--ranges": common, "--velocity odometry": contact, "--scene": isinstance(scene, Path)}
+        for flag in (flag for flag, value in given.items() if value):
+            raise UserError(f"{flag} needs the walking exam, and this policy has another: leave it out")
         rules: walking.ExamRules | Skill = contract_skill(contract)
-        result = run_skill(folder, rules, edited=edited)
-        print(rules.table(result))
     else:
         rules = contract_rules(contract, common)
-        result = run_exam(folder, rules, contact=contact, edited=edited, scene=scene)
-        print(walking.table(result))
-        if hard and contract.feet:
-            result["hard"], _ = run_hard(folder, rules, result["walks"], edited, scene, contact=contact)
-            print(f"\n{table(result['hard'])}")
-    if hard:
-        result["heat"] = run_heat(folder, rules, edited, scene, contact)
-        print(f"\n{heat.table(result['heat'])}")
+    result, _ = run(folder, rules, hard, edited=edited, scene=scene, contact=contact, show=print)
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"scene": shown(scene)} if isinstance(scene, Path) else {}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}

@@ -6,6 +6,7 @@ A step has the order of the environment's exams, so both give equal results: sam
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,38 +16,53 @@ import numpy as np
 
 from legged_mw.deploy.contract import CONTRACT_FILE, OWN, SCENE_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.controller import Controller
-from legged_mw.deploy.hard_exam import run_hard, strip_png
-from legged_mw.deploy.heat_exam import run_heat
+from legged_mw.deploy.hard_exam import commands_of, push_around, run_hard
+from legged_mw.deploy.heat_exam import run_heat, start_skill
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.eval import walking
-from legged_mw.eval.skills import ExamGround, ExamRobot, Recording, ReferenceMotion, Skill, make_skill
+from legged_mw.eval import heat, walking
+from legged_mw.eval.hard import table
+from legged_mw.eval.skills import ExamGround, ExamRobot, Recording, Skill, make_skill
 from legged_mw.eval.walking import ExamRules, in_common
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, unknown
 
 
-def run(folder: Path, exam: ExamRules | Skill, hard: bool = True) -> tuple[dict[str, Any], bytes]:
-    """Grade the export in ``folder`` by the rules ``exam``. Returns the result and a PNG of one stride, or b"".
+def run(
+    folder: Path,
+    exam: ExamRules | Skill,
+    hard: bool = True,
+    *,
+    edited: bool = False,
+    scene: str | Path = SCENE_FILE,
+    contact: str | None = None,
+    show: Callable[[str], None] = lambda _: None,
+) -> tuple[dict[str, Any], list[Floats]]:
+    """Grade the export in ``folder`` by the rules ``exam``. Returns the result and the poses of one stride, if any.
 
-    ``hard`` adds heat and power. For a walking policy it also adds the hard exam and the PNG.
+    ``hard`` adds heat and power. For a walking policy it also adds the hard exam and the poses.
+    ``edited``, ``contact``, ``scene`` (``scene_file``): see DeployStage. ``show`` gets each table when it is ready.
     """
-    heat: dict[str, Any] = {"heat": run_heat(folder, exam)} if hard else {}
+    poses: list[Floats] = []
     if isinstance(exam, Skill):
-        return run_skill(folder, exam) | heat, b""
-    result, contract = run_exam(folder, exam) | heat, read_contract(folder)
-    if not hard or not contract.feet:
-        return result, b""
-    result["hard"], poses = run_hard(folder, exam, result["walks"])
-    return result, strip_png(folder, contract, poses)
+        result = run_skill(folder, exam, edited)
+        show(exam.table(result))
+    else:
+        result = run_exam(folder, exam, contact, edited, scene)
+        show(walking.table(result))
+        if hard and read_contract(folder, edited).feet:
+            result["hard"], poses = run_hard(folder, exam, result["walks"], edited, scene, contact=contact)
+            show(f"\n{table(result['hard'])}")
+    if hard:
+        result["heat"] = run_heat(folder, exam, edited, scene, contact)
+        show(f"\n{heat.table(result['heat'])}")
+    return result, poses
 
 
 def run_exam(
     folder: Path,
     exam: ExamRules | None = None,
-    threads: int = 0,
-    common: bool = False,
     contact: str | None = None,
     edited: bool = False,
     scene: str | Path = SCENE_FILE,
@@ -54,18 +70,15 @@ def run_exam(
 ) -> dict[str, Any]:
     """Grade the export in ``folder`` by ``exam``, or by its contract's rules. Raises ContractError, ConfigError.
 
-    ``common``: use the contract's rules with the common command range of the robot's published policies.
-    ``contact``, ``edited``, ``scene`` (``scene_file``): see DeployStage. ``seed``: of the start, see ``scatter``.
+    ``contact``, ``edited``, ``scene``: see ``run``. ``seed``: of the start, see ``scatter``.
     """
     contract = read_contract(folder, edited)
-    exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
-    commands = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
-    pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
-    commands[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
+    exam = exam or contract_rules(contract)
+    velocities = [*exam.held(), *[(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))]
+    commands = commands_of(contract, velocities)
+    groups = [(len(exam.held()) + i * walking.PUSH_DIRECTIONS, speed) for i, speed in enumerate(exam.push_speeds)]
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # as in legged_mw.eval.rollout
-    stage = DeployStage(
-        folder, len(commands), threads=threads, scene_file=scene, ends=ends, contact=contact, edited=edited
-    )
+    stage = DeployStage(folder, len(commands), scene_file=scene, ends=ends, contact=contact, edited=edited)
     stage.scatter(seed)
     fell_at = np.full(len(commands), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
@@ -74,7 +87,8 @@ def run_exam(
         sampled["position"].append(stage.qpos()[:, :2])
         sampled["power"].append(np.abs(stage.measured.joint_torque * stage.measured.joint_vel).sum(axis=1))
         sampled["joint_speed"].append(np.abs(stage.measured.joint_vel).mean(axis=1))
-        _push(stage, exam, step)  # the policy acts on the measurement from before the push
+        # the policy acts on the measurement from before the push
+        push_around(stage, step - round(walking.PUSH_AT / stage.dt), groups, walking.PUSH_DIRECTIONS)
         stage.step(commands)
         estimate = stage.believed_velocity()  # of the same measurement
         sampled["estimate"] += [] if estimate is None else [estimate]
@@ -85,17 +99,14 @@ def run_exam(
     )
 
 
-def run_skill(
-    folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False, seed: int = 0
-) -> dict[str, Any]:
+def run_skill(folder: Path, skill: Skill | None = None, edited: bool = False, seed: int = 0) -> dict[str, Any]:
     """Grade the export in ``folder`` by ``skill``, or by the skill exam of its contract.
 
     ``edited``: see DeployStage. ``seed``: of the start, see ``scatter``.
     """
     skill = skill or contract_skill(read_contract(folder, edited))
-    grounds = skill.grounds.items()
     return skill.result(
-        {name: skill.judge(*perform(folder, skill, ground, threads, edited, seed)) for name, ground in grounds}
+        {name: skill.judge(*perform(folder, skill, ground, edited, seed)) for name, ground in skill.grounds.items()}
     )
 
 
@@ -109,17 +120,11 @@ def contract_skill(contract: Contract) -> Skill:
 
 
 def perform(
-    folder: Path, skill: Skill, ground: ExamGround, threads: int = 0, edited: bool = False, seed: int = 0
+    folder: Path, skill: Skill, ground: ExamGround, edited: bool = False, seed: int = 0
 ) -> tuple[ExamRobot, Recording]:
     """Put the robots in their start states on ``ground`` and run the policy."""
-    stage = DeployStage(
-        folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited
-    )
-    source, follower = stage.contract.motion, stage.controller.follower
-    motion = ReferenceMotion(follower.clip.qpos(), source.bodies, source.anchor) if source and follower else None
-    robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
-    if starts := skill.starts(robot, skill.robots):
-        stage.put(*starts)
+    stage = DeployStage(folder, skill.robots, change=lambda model: put_on(model, ground), edited=edited)
+    robot = start_skill(stage, skill)
     stage.scatter(seed)
     steps = []
     ended_at = np.full(skill.robots, math.inf)
@@ -167,16 +172,6 @@ def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
         raise ContractError(f"{CONTRACT_FILE}: exam: {error}") from error
 
 
-def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
-    """In step k after the first push, push one robot at each push speed in direction k, world frame."""
-    k = step - round(walking.PUSH_AT / stage.dt)
-    if 0 <= k < walking.PUSH_DIRECTIONS:
-        angle = 2 * math.pi * k / walking.PUSH_DIRECTIONS
-        for i, speed in enumerate(exam.push_speeds):
-            world = len(exam.held()) + i * walking.PUSH_DIRECTIONS + k
-            stage.push(world, [speed * math.cos(angle), speed * math.sin(angle)])
-
-
 # ---- two policies on one robot: after a fall the second runs until the robot stands ---------------------------------
 
 
@@ -208,9 +203,7 @@ class SwitchStage(DeployStage):
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
 
     def step(self, commands: Floats | None = None) -> None:
-        self._commands = (
-            self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
-        )
+        self._take(commands)
         self._seen, rescued = self.measured, self.rescued[:, None]
         targets = self.controller.act(self._seen, self._commands), self.rescuer.act(self._seen, self._none)
         self.fleet.write(np.where(rescued, targets[1], targets[0]))

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
+from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, compile_scene, read_contract
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Fleet, trunk_of
 from legged_mw.deploy.stage import DeployStage
@@ -70,11 +70,13 @@ def run_conditions(
     stage = make(count, ends=ends)
     stage.scatter(seed)
     apply_conditions(stage, np.repeat(np.arange(len(CONDITIONS)), len(velocities)), load, seed)
+    ends_of_groups = range(len(velocities), count + 1, len(velocities))
+    groups = [(end - hard.PUSH_DIRECTIONS, hard.push_speed(len(contract.feet))) for end in ends_of_groups]
     fell_at, velocity, position = np.full(count, math.inf), [], []
     for step in range(round(hard.SECONDS / stage.dt)):
         velocity.append(stage.velocity())
         position.append(stage.qpos()[:, :2])
-        _push(stage, step, len(velocities), hard.push_speed(len(contract.feet)))
+        push_around(stage, step - round(hard.PUSH_AT / stage.dt), groups, hard.PUSH_DIRECTIONS)
         stage.step(commands)
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     speeds, positions, results = np.stack(velocity), np.stack(position), {}
@@ -113,15 +115,12 @@ def apply_conditions(stage: DeployStage, which: NDArray[np.int64], load: float, 
     stage.disturb = disturb
 
 
-def _push(stage: DeployStage, step: int, worlds: int, speed: float) -> None:
-    """In step k after the first push, push one robot of each condition in direction k."""
-    k = step - round(hard.PUSH_AT / stage.dt)
-    if not 0 <= k < hard.PUSH_DIRECTIONS:
-        return
-    angle = 2.0 * math.pi * k / hard.PUSH_DIRECTIONS
-    for i in range(len(CONDITIONS)):
-        world = (i + 1) * worlds - hard.PUSH_DIRECTIONS + k
-        stage.push(world, [speed * math.cos(angle), speed * math.sin(angle)])
+def push_around(stage: DeployStage, k: int, groups: Sequence[tuple[int, float]], directions: int) -> None:
+    """Push robot k of each group in direction k, world frame. ``groups``: first world, speed [m/s]."""
+    if 0 <= k < directions:
+        angle = 2.0 * math.pi * k / directions
+        for first, speed in groups:
+            stage.push(first + k, [speed * math.cos(angle), speed * math.sin(angle)])
 
 
 # ---- the gait of one robot ------------------------------------------------------------------------------------------
@@ -169,8 +168,7 @@ class Witness:
         self.fleet, self.model, contract = fleet, fleet.model, fleet.contract
         self.trunk, self.feet = trunk_of(fleet.model), feet_of(fleet)
         self._joints = [self.model.joint(name).id for name in contract.joints]
-        self._dofs, self._angles = self.model.jnt_dofadr[self._joints], self.model.jnt_qposadr[self._joints]
-        self._damping = contract.damping if fleet.damps_by_joint else np.zeros(len(self._joints))
+        self._angles = self.model.jnt_qposadr[self._joints]
         bodies = [self.trunk, *(int(self.model.geom_bodyid[geoms[0]]) for geoms in self.feet)]
         start = mujoco.MjData(self.model)
         start.qpos[:] = fleet.qpos[0]
@@ -196,7 +194,6 @@ class Witness:
         heading = math.atan2(rotation[0][1, 0], rotation[0][0, 0])
         positions = np.array([now.geom_xpos[geoms].mean(axis=0) for geoms in self.feet]).reshape(-1, 3)
         sideways = math.cos(heading) * (positions[:, 1] - y) - math.sin(heading) * (positions[:, 0] - x)
-        torque = data.qfrc_actuator[self._dofs] - self._damping * data.qvel[self._dofs]
         self._rows.append(
             {
                 "tilt": np.array([math.atan2(up[1], up[2]), math.atan2(-up[0], up[2])]),
@@ -205,8 +202,8 @@ class Witness:
                 "sole": np.arccos(np.clip(rotation[1:, 2, 2], -1.0, 1.0)),
                 "force": self._forces(data),
                 "angle": now.qpos[self._angles].copy(),
-                "torque": torque,
-                "speed": data.qvel[self._dofs].copy(),
+                "torque": self.fleet.motor_torque()[0],
+                "speed": self.fleet.motor_speed()[0],
             }
         )
 
@@ -264,7 +261,7 @@ def has_sole(model: mujoco.MjModel, geoms: Sequence[int]) -> bool:
 VIEWS = {"side": 90.0, "front": 180.0}  # [deg] azimuth of the camera: at the robot's right, in front of it
 
 
-def strip_png(folder: Path, contract: Contract, poses: Sequence[Floats]) -> bytes:
+def strip_png(folder: Path, poses: Sequence[Floats]) -> bytes:
     """A PNG of one stride: a row from the side and a row from the front. Empty without poses or OpenGL."""
     from legged_mw.view.recorder import contact_sheet, save_png  # imports OpenGL
     from legged_mw.view.stage import ViewError
@@ -272,7 +269,7 @@ def strip_png(folder: Path, contract: Contract, poses: Sequence[Floats]) -> byte
     if not poses:
         return b""
     try:
-        frames = _frames(Fleet(folder, contract, 1, threads=1).model, poses)
+        frames = _frames(compile_scene(folder / SCENE_FILE), poses)
     except ViewError as error:
         print(f"no strip of pictures: {error}")
         return b""

@@ -123,14 +123,20 @@ def _run(stage: DeployStage, seconds: float, command: Floats) -> bool:
 
 def perform(stage: DeployStage, log: MotorLog, skill: Skill) -> Motion | None:
     """Run TRIES robots on the first ground of the skill exam. Returns the record of those that do not fall, or None."""
-    source, follower = stage.contract.motion, stage.controller.follower
-    motion = ReferenceMotion(follower.clip.qpos(), source.bodies, source.anchor) if source and follower else None
-    robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
-    if starts := skill.starts(robot, stage.num_worlds):
-        stage.put(*starts)
+    robot = start_skill(stage, skill)
     standing = np.ones(stage.num_worlds, dtype=bool)
     for _ in range(skill.steps(robot)):
         stage.step()
         standing &= ~stage.fell()
     torque, speed = log.take()
     return Motion(torque[:, standing], speed[:, standing]) if standing.any() else None
+
+
+def start_skill(stage: DeployStage, skill: Skill) -> ExamRobot:
+    """Put the robots in the start states of a skill exam. Returns the robot as the exam knows it."""
+    source, follower = stage.contract.motion, stage.controller.follower
+    motion = ReferenceMotion(follower.clip.qpos(), source.bodies, source.anchor) if source and follower else None
+    robot = ExamRobot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
+    if starts := skill.starts(robot, stage.num_worlds):
+        stage.put(*starts)
+    return robot

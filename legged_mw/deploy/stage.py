@@ -66,9 +66,7 @@ class DeployStage:
 
     def step(self, commands: Floats | None = None) -> None:
         """Run one period with ``commands`` (N, C); None: the default commands. A robot that falls is reset."""
-        self._commands = (
-            self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
-        )
+        self._take(commands)
         seen = self.disturb(self.measured) if self.disturb else self.measured
         self._seen = self.odometry(seen) if self.odometry else seen
         self.fleet.write(self.controller.act(self._seen, self._commands))
@@ -77,6 +75,9 @@ class DeployStage:
             self.fleet.reset(np.flatnonzero(self._fell))
             self._forget(self._fell)
         self.measured = self.fleet.read()
+
+    def _take(self, commands: Floats | None) -> None:
+        self._commands = np.array(self._own if commands is None else commands, dtype=float).reshape(self._own.shape)
 
     def commands(self) -> Floats:
         """Commands (N, C) of the last step, in the order of ``command_table``."""
