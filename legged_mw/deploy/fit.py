@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +22,8 @@ from mujoco import minimize
 from mujoco.rollout import Rollout
 
 from legged_mw.deploy.chirp import REST, SLOWEST
-from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.log import DriveLog, LogError, read_log
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.log import DriveLog, LogError, logged_export
 from legged_mw.deploy.other_root import between, motion_of, with_root
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import read_scene, trunk_of
@@ -125,14 +124,8 @@ def fit_log(path: Path, joints: Sequence[str] = (), leave_out: Sequence[str] = (
 
     Raises LogError, ContractError.
     """
-    began, recording = time.monotonic(), read_log(path)
-    with tempfile.TemporaryDirectory() as own:
-        for name, content in recording.files.items():
-            (Path(own) / name).write_bytes(content)
-        folder = Path(own) if recording.files else Path(recording.header["export"])
-        contract = read_contract(folder)
-        if contract.digest != recording.header["network"]:
-            raise LogError(f"{shown(path)} was recorded with another network than the one in {shown(folder)}")
+    began = time.monotonic()
+    with logged_export(path) as (recording, folder, contract):
         scene = read_scene(folder, contract)
     for part in leave_out:
         if not any(part in name for name in contract.joints):

@@ -11,11 +11,13 @@ import io
 import json
 import queue
 import struct
+import tempfile
 import threading
 import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,7 @@ from legged_mw.deploy.contract import (
     SCENE_FILE,
     TERRAIN_FILE,
     Contract,
+    read_contract,
 )
 from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.loop import Loop
@@ -242,3 +245,25 @@ def _blocks(path: Path) -> Iterator[dict[str, Any]]:
                 return
             with np.load(io.BytesIO(data), allow_pickle=False) as block:
                 yield {name: block[name] for name in block.files}
+
+
+@contextmanager
+def logged_export(
+    path: Path, folder: Path | None = None, edited: bool = False
+) -> Iterator[tuple[DriveLog, Path, Contract]]:
+    """The log, and the export in ``folder`` (None: the one in the log) with its contract.
+
+    ``edited``: see read_contract. Raises LogError, ContractError.
+    """
+    recording = read_log(path)
+    with tempfile.TemporaryDirectory() as own:
+        for name, content in recording.files.items():
+            (Path(own) / name).write_bytes(content)
+        folder = folder or (Path(own) if recording.files else Path(recording.header["export"]))
+        contract = read_contract(folder, edited)
+        if contract.digest != recording.header["network"]:
+            raise LogError(
+                f"{shown(path)} was recorded with another network than the one in {shown(folder)} "
+                f"({recording.header['task']}); name its export"
+            )
+        yield recording, folder, contract

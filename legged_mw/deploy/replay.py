@@ -7,7 +7,6 @@ Its targets are clipped like the robot's.
 from __future__ import annotations
 
 import math
-import tempfile
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,9 +14,9 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.contract import ESTIMATE, Contract, columns_of, read_contract
+from legged_mw.deploy.contract import ESTIMATE, Contract, columns_of
 from legged_mw.deploy.controller import Controller
-from legged_mw.deploy.log import DriveLog, LogError, read_log
+from legged_mw.deploy.log import DriveLog, LogError, logged_export
 from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.robot import QUANTITIES, Floats
 from legged_mw.deploy.safety import Limits, Safety
@@ -48,26 +47,12 @@ def replay(path: Path, folder: Path | None = None, edited: bool = False) -> Repl
 
     ``edited``: see read_contract. Raises LogError or ContractError.
     """
-    recording = read_log(path)
-    with tempfile.TemporaryDirectory() as own:
-        for name, content in recording.files.items():
-            (Path(own) / name).write_bytes(content)
-        return _replay(
-            path, recording, folder or (Path(own) if recording.files else Path(recording.header["export"])), edited
-        )
-
-
-def _replay(path: Path, recording: DriveLog, folder: Path, edited: bool) -> Replay:
-    contract = read_contract(folder, edited)
-    if contract.digest != recording.header["network"]:
-        raise LogError(
-            f"{shown(path)} was recorded with another network than the one in {shown(folder)} ({recording.header['task']}); name its export"
-        )
-    walk = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
-    if walk.stop - walk.start < SHORTEST:
-        raise LogError(f"{shown(path)} has no walk of {SHORTEST} steps: the policy ran for less time")
-    rows = {name: values[walk].astype(float) for name, values in recording.rows.items()}
-    return Replay(contract, recording, rows, _simulate(folder, contract, rows))
+    with logged_export(path, folder, edited) as (recording, export, contract):
+        walk = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
+        if walk.stop - walk.start < SHORTEST:
+            raise LogError(f"{shown(path)} has no walk of {SHORTEST} steps: the policy ran for less time")
+        rows = {name: values[walk].astype(float) for name, values in recording.rows.items()}
+        return Replay(contract, recording, rows, _simulate(export, contract, rows))
 
 
 def _longest(on: Any) -> slice:
