@@ -110,11 +110,11 @@ def draft(file: Path, simple: bool = False) -> Draft:
     feet = guess_feet(robot, rest.qpos)
     _refuse_lost_feet(robot, rest.qpos, feet)
     maker = find_maker(file, robot.spec.modelname, robot.joint_names)
-    judged = judge_poses(robot, feet, maker, from_file)
+    judged = judge_poses(robot, [foot.geoms for foot in feet], maker, from_file)
     pose = np.clip(judged[0].candidate.angles, *robot.joint_range.T).round(4) + 0.0  # no -0.0
     feet = guess_feet(robot, stand_as_statue(robot, pose, place).qpos)
     angles = dict(zip(robot.joint_names, pose.tolist(), strict=True))
-    walking = walking_joints(robot.physics, feet)
+    walking = walking_joints(robot.physics, [foot.geoms for foot in feet])
     held = [name for i, name in enumerate(robot.joint_names) if i not in walking]
     if held:
         robot = _bare(file, False, held, angles).robot
@@ -522,7 +522,7 @@ def pose_weights(
     model, data = robot.physics, posed(robot.physics, pose)
     weights = [quiet if len(feet) == 2 else 1.0] * len(robot.joint_names)
     for foot in feet:
-        legs = joints_to(model, foot)
+        legs = joints_to(model, foot.geoms)
         sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > SIDEWAYS]
         if len(feet) != 2:
             for joint in sideways[1:2]:

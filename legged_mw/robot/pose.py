@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -50,17 +50,7 @@ UNEVEN = 0.1  # share of the leg's length: difference in height between the feet
 BEND = 0.4  # [rad] error of a knee's bend that counts as much as a sag of SAG
 
 
-class Sole(Protocol):
-    """A foot."""
-
-    @property
-    def geoms(self) -> tuple[str, ...]: ...
-
-
-class _Whole(NamedTuple):
-    """A foot with all colliding geoms of its body. Without them, a tilted sole would have only its lowest geoms."""
-
-    geoms: tuple[str, ...]
+Sole = tuple[str, ...]  # the geoms of a foot
 
 
 class Leg(NamedTuple):
@@ -139,33 +129,33 @@ def find_legs(robot: RobotModel, neutral: FloatArray, feet: Sequence[Sole]) -> l
     """The legs, one per foot. Empty if a leg has fewer than two pitch joints."""
     model = robot.physics
     data = posed(model, neutral)
-    points = surfaces(model, data, [geom for foot in feet for geom in foot.geoms])
-    legs, wheels = [], find_wheels(robot, neutral)
+    points = surfaces(model, data, [geom for foot in feet for geom in foot])
+    legs = []
     for foot in feet:
-        joints = [joint for joint in joints_to(model, foot) if _is_sideways(model, data, joint)]
-        joints = [joint for joint in joints if model.joint(joint).name not in wheels]
+        joints = _pitch_joints(robot, neutral, foot)
         if len(joints) < 2:
             return []
-        sole = np.concatenate([points[geom] for geom in foot.geoms])[:, [0, 2]]
+        sole = np.concatenate([points[geom] for geom in foot])[:, [0, 2]]
         legs.append(_leg(model, data, neutral, joints, sole, len(feet)))
     return legs
 
 
 def _whole(robot: RobotModel, neutral: FloatArray, foot: Sole) -> Sole:
-    """The foot, with all geoms of its body if the leg has an ankle. Without one the shank may belong to that body."""
+    """The foot, with all colliding geoms of its body if the leg has an ankle; the shank may belong to it without one.
+
+    Without them, a tilted sole would have only its lowest geoms.
+    """
     model = robot.physics
-    data, wheels = posed(model, neutral), find_wheels(robot, neutral)
-    sideways = [joint for joint in joints_to(model, foot) if _is_sideways(model, data, joint)]
-    if sum(model.joint(joint).name not in wheels for joint in sideways) < 3:
+    if len(_pitch_joints(robot, neutral, foot)) < 3:
         return foot
-    body = model.body(int(model.geom(foot.geoms[0]).bodyid[0]))
+    body = model.body(int(model.geom(foot[0]).bodyid[0]))
     geoms = range(int(body.geomadr[0]), int(body.geomadr[0] + body.geomnum[0]))
-    return _Whole(tuple(model.geom(geom).name for geom in geoms if model.geom_conaffinity[geom]))
+    return tuple(model.geom(geom).name for geom in geoms if model.geom_conaffinity[geom])
 
 
 def joints_to(model: mujoco.MjModel, foot: Sole) -> list[int]:
     """The joints from the root to the foot, without the root joint."""
-    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
+    body, joints = int(model.geom(foot[0]).bodyid[0]), []
     while body:
         first = int(model.body_jntadr[body])
         joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
@@ -173,8 +163,12 @@ def joints_to(model: mujoco.MjModel, foot: Sole) -> list[int]:
     return sorted(joints)
 
 
-def _is_sideways(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> bool:
-    return model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE and abs(data.xaxis[joint][1]) > SIDEWAYS
+def _pitch_joints(robot: RobotModel, neutral: FloatArray, foot: Sole) -> list[int]:
+    """The joints to the foot with an axis along y, without those of wheels."""
+    model, wheels = robot.physics, find_wheels(robot, neutral)
+    data = posed(model, neutral)
+    hinges = [joint for joint in joints_to(model, foot) if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE]
+    return [j for j in hinges if abs(data.xaxis[j][1]) > SIDEWAYS and model.joint(j).name not in wheels]
 
 
 def _leg(
@@ -413,8 +407,8 @@ def judge(
     angles = np.clip(candidate.angles, *robot.joint_range.T)
     data = posed(model, angles)
     mujoco.mj_comPos(model, data)
-    points = surfaces(model, data, [geom for foot in feet for geom in foot.geoms])
-    soles = [np.concatenate([points[geom] for geom in foot.geoms]) for foot in feet]
+    points = surfaces(model, data, [geom for foot in feet for geom in foot])
+    soles = [np.concatenate([points[geom] for geom in foot]) for foot in feet]
     lows = np.array([sole[:, 2].min() for sole in soles])
     size = max((leg.length for leg in legs), default=max(-float(lows.min()), 0.1))
     standing = [sole for sole, low in zip(soles, lows, strict=True) if low <= lows.min() + UNEVEN * size]
@@ -496,7 +490,7 @@ def _sag(
         places[:, :2] += com - forces @ places[:, :2] / weight
     for foot, place, force in zip(feet, places, forces, strict=True):
         jacobian = np.zeros((3, model.nv))
-        mujoco.mj_jac(model, data, jacobian, None, place, int(model.geom(foot.geoms[0]).bodyid[0]))
+        mujoco.mj_jac(model, data, jacobian, None, place, int(model.geom(foot[0]).bodyid[0]))
         torque -= jacobian[2] * force
     known = maker.of("kp", names) if maker else {}
     walking = sorted(walking_joints(model, feet))
