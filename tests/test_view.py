@@ -128,16 +128,6 @@ def test_a_gif_needs_no_encoder_of_mp4(tmp_path: Path, monkeypatch: pytest.Monke
     VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5).abort()
 
 
-def test_bad_video_requests(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="fps = 0"):
-        VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=0)
-    writer = VideoWriter(tmp_path / "empty.mp4", 320, 240, 50)
-    with pytest.raises(ValueError, match=r"uint8 \(240, 320, 3\); got float64 \(2, 2, 3\)"):
-        writer.add(np.zeros((2, 2, 3)))  # pyright: ignore[reportArgumentType]
-    writer.abort()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_contact_sheet_and_png(tmp_path: Path) -> None:
     sheet = contact_sheet(frames(5)[1:], columns=3)
     assert sheet.shape == (480, 960, 3)
@@ -145,8 +135,6 @@ def test_contact_sheet_and_png(tmp_path: Path) -> None:
     save_png(tmp_path / "new" / "sheet.png", sheet)
     with av.open(str(tmp_path / "new" / "sheet.png")) as container:
         assert np.array_equal(next(container.decode(video=0)).to_ndarray(format="rgb24"), sheet)
-    with pytest.raises(ValueError, match="got 0 frames, 3 columns"):
-        contact_sheet([], columns=3)
 
 
 def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path) -> None:
@@ -512,16 +500,9 @@ def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:
         assert one > 5 and four > 2.5 * one
 
 
-def test_bad_poses_and_models(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
-    with pytest.raises(ValueError, match=r"qpos has shape \(3,\); this model has nq = 9"):
-        renderer.frame(moment(model, qpos=np.zeros((1, 3))))
+def test_a_pose_that_is_not_finite(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
     with pytest.raises(ValueError, match=r"qpos\[8\] is not finite"):
         renderer.frame(moment(model, qpos=np.append(model.qpos0[:-1], np.nan)[None]))
-    with pytest.raises(ValueError, match=r"\(vx, vy, yaw rate\), shape \(3,\); got shape \(2,\)"):
-        renderer.frame(moment(model, target_velocity=np.zeros((1, 2))))
-    arm = '<mujoco><worldbody><body><joint name="elbow"/><geom size=".1"/></body></worldbody></mujoco>'
-    with pytest.raises(ValueError, match="free joint, which must be the model's first joint; found 'elbow'"):
-        PosedRobots(mujoco.MjSpec.from_string(arm))
 
 
 def test_missing_opengl_names_the_remedy_and_the_state() -> None:

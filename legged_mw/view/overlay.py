@@ -59,9 +59,6 @@ def draw_velocities(
     A component with target NaN gets no arrow. `turn`: draw the yaw rate too. `top_speed` [m/s]: gets the longest arrow.
     """
     target, velocity = np.asarray(target, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
-    for array in (target, velocity):
-        if array.shape != (3,):
-            raise ValueError(f"A velocity to draw is (vx, vy, yaw rate), shape (3,); got shape {array.shape}.")
     for array, rgba, level in ((target, COMMAND_RGBA, LEVELS[0]), (velocity, VELOCITY_RGBA, LEVELS[1])):
         origin = placement.position + (0.0, 0.0, placement.top + level * placement.radius)
         if not np.isnan(target[:2]).any():

@@ -34,19 +34,14 @@ class Placement(NamedTuple):
 class PosedRobots:
     """All robots of one picture as one `model` with its `data`, without dynamics.
 
-    The followed robot is always the first one in the model, so lights and cameras follow it and a camera can track its
-    body `base`. `offsets` (N, 3) [m] place the robots side by side; on rough terrain they are zero. `radius`, `top` and
-    `bottom` [m] are measured in the model's first pose.
+    The first joint of `spec` must be the robot's free joint. The followed robot is always the first one in the model, so
+    lights and cameras follow it and a camera can track its body `base`. `offsets` (N, 3) [m] place the robots side by
+    side; on rough terrain they are zero. `radius`, `top` and `bottom` [m] are measured in the model's first pose.
     """
 
     def __init__(self, spec: mujoco.MjSpec, count: int = 1) -> None:
         single = spec.compile()
-        if single.njnt == 0 or single.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-            first = "no joint at all" if single.njnt == 0 else f"{single.joint(0).name!r}, which is not one"
-            raise ValueError(
-                f"A viewer follows the robot's free joint, which must be the model's first joint; found {first}."
-            )
-        self.count, self._nq = count, single.nq
+        self.count = count
         self.model, self._bases, self._feet = many_robots(spec, single, count)
         self.data, self.base = mujoco.MjData(self.model), self._bases[0]
         self._ghost: mujoco.MjData | None = None  # created for the first ghost
@@ -66,10 +61,6 @@ class PosedRobots:
     def pose(self, qpos: ArrayLike, world: int = 0) -> None:
         """Pose all robots by the rows of `qpos` (N, nq), and follow robot `world`."""
         array = np.atleast_2d(np.array(qpos, dtype=np.float64))[: self.count]
-        if array.shape[1:] != (self._nq,):
-            raise ValueError(
-                f"qpos has shape {array.shape[1:]}; this model has nq = {self._nq}, so ({self._nq},) is needed."
-            )
         if not np.isfinite(array).all():
             raise ValueError(
                 f"qpos[{int(np.argwhere(~np.isfinite(array))[0, 1])}] is not finite: the simulation diverged."

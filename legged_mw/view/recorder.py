@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import struct
 import zlib
@@ -211,8 +210,6 @@ class VideoWriter:
             raise ViewError(
                 f"A video of {width} x {height} cannot be encoded: yuv420p needs an even width and an even height."
             )
-        if not (math.isfinite(fps) and fps > 0):
-            raise ValueError(f"fps = {fps}: a video needs a positive number of frames per second.")
         if (reason := no_encoder(kind)) is not None:
             raise ViewError(reason)
         self.width, self.height, self.frames = width, height, 0
@@ -222,12 +219,6 @@ class VideoWriter:
 
     def add(self, frame: Frame) -> None:
         """Append one frame (height, width, 3)."""
-        if self._container is None:
-            raise RuntimeError(f"{self.path} is closed: no frame can be added.")
-        if frame.shape != (self.height, self.width, 3) or frame.dtype != np.uint8:
-            raise ValueError(
-                f"A frame of this video is uint8 {(self.height, self.width, 3)}; got {frame.dtype} {frame.shape}."
-            )
         picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
         picture.pts, picture.time_base = self.frames, self._time
         self._palette.push(picture) if self._palette else self._write(picture)
@@ -319,10 +310,6 @@ def no_encoder(kind: str = ".mp4") -> str | None:
 
 def contact_sheet(frames: Sequence[Frame], columns: int) -> Frame:
     """A picture of equally large frames in rows of `columns`. The rest of the last row is black."""
-    if not frames or columns < 1:
-        raise ValueError(
-            f"A contact sheet needs frames and at least one column; got {len(frames)} frames, {columns} columns."
-        )
     height, width = frames[0].shape[:2]
     rows = -(-len(frames) // columns)
     sheet = np.zeros((rows * columns, height, width, 3), dtype=np.uint8)
