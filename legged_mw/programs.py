@@ -150,14 +150,6 @@ def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False)
     return export(task, checkpoint, folder, half).text(folder)
 
 
-def deploy() -> None:
-    """Run an exported policy without torch."""
-    from legged_mw.deploy.__main__ import main
-
-    with one_line_errors(fewer=FEWER_WORLDS):
-        main()
-
-
 def exam() -> None:
     """Grade a policy, and compare with an earlier result. A run without an export is exported first."""
     from legged_mw.deploy.gate import main
@@ -173,19 +165,11 @@ def exam() -> None:
         main(make)
 
 
-def robot() -> None:
-    """Show a robot's health page, and write a first task for it."""
-    from legged_mw.robot.__main__ import main
-
-    with one_line_errors():
-        main()
-
-
-def _tool(name: str) -> Callable[[], None]:
-    """A program that runs ``main`` of the tool."""
+def _main_of(name: str, fewer: str = "") -> Callable[[], None]:
+    """The program in ``main`` of a module. ``fewer``: see ``one_line_errors``."""
 
     def start() -> None:
-        with one_line_errors():
+        with one_line_errors(fewer=fewer):
             import_module(name).main()
 
     return start
@@ -202,15 +186,15 @@ def completion() -> None:
 PROGRAMS: dict[str, Callable[[], None]] = {
     "train": train,
     "play": play,
-    "deploy": deploy,
+    "deploy": _main_of("legged_mw.deploy.__main__", FEWER_WORLDS),
     "exam": exam,
-    "fit": _tool("legged_mw.deploy.fit"),
-    "robot": robot,
-    "motion": _tool("legged_mw.motion.__main__"),
-    "doctor": _tool("legged_mw.tools.doctor"),
-    "compare": _tool("legged_mw.tools.compare"),
-    "sweep": _tool("legged_mw.tools.sweep"),
-    "warm": _tool("legged_mw.tools.warm"),
+    "fit": _main_of("legged_mw.deploy.fit"),
+    "robot": _main_of("legged_mw.robot.__main__"),
+    "motion": _main_of("legged_mw.motion.__main__"),
+    "doctor": _main_of("legged_mw.tools.doctor"),
+    "compare": _main_of("legged_mw.tools.compare"),
+    "sweep": _main_of("legged_mw.tools.sweep"),
+    "warm": _main_of("legged_mw.tools.warm"),
     "completion": completion,
 }
 HELP = """legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help

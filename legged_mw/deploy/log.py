@@ -55,11 +55,10 @@ class LogError(UserError, ValueError):
     """The file is not a log or cannot be written."""
 
 
-def log_path(contract: Contract, folder: Path = LOGS) -> Path:
+def log_path(contract: Contract) -> Path:
     """The default path of a run's log."""
-    return (
-        folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
-    )
+    task = check_name(contract.task, f"{CONTRACT_FILE}: task")
+    return LOGS / f"{task}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
 
 
 def _columns(contract: Contract) -> dict[str, int]:

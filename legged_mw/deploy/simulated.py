@@ -171,9 +171,9 @@ class Fleet:
         age = np.maximum(self._late - step + self.contract.decimation - 1, 0) // self.contract.decimation
         return self._sent[age, np.arange(self.count)]
 
-    def read_data(self, data: mujoco.MjData, world: int = 0) -> None:
-        """Copy one robot's data into ``data``. With ``each`` it has the forces of the last physics step."""
-        self._batch.get_data(world, data)
+    def read_data(self, data: mujoco.MjData) -> None:
+        """Copy the first robot's data into ``data``. With ``each`` it has the forces of the last physics step."""
+        self._batch.get_data(0, data)
 
     def _step(self, count: int, stage: int) -> None:
         try:

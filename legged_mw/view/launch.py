@@ -30,12 +30,10 @@ class FlagError(UserError, ValueError):
     """Flags that exclude each other, or an invalid value."""
 
 
-def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
+def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of watching and driving. The program adds `--command` and `--time` [s] itself."""
-    best = " (auto: the best that this machine has)"
-    parser.add_argument(
-        "--viewer", choices=VIEWERS, default=viewer, help=f"where to show it, by default {viewer}{best}"
-    )
+    where = "where to show it, by default auto (auto: the best that this machine has)"
+    parser.add_argument("--viewer", choices=VIEWERS, default="auto", help=where)
     parser.add_argument("--video", metavar="FILE", help="record an .mp4 or a .gif instead")
     parser.add_argument(
         "--sheet", metavar="FILE.png", help="write one picture of twelve moments instead, or beside the video"
