@@ -237,7 +237,7 @@ def test_a_log_needs_nothing_beside_it(
     recording = read_log(logged[0])
     assert recording.files["scene.xml"] == (GO2 / "scene.xml").read_bytes() and len(recording.files) == 3
     elsewhere = replace(recording, header=recording.header | {"export": str(tmp_path)})
-    monkeypatch.setattr("legged_mw.deploy.replay.read_log", lambda _: elsewhere)
+    monkeypatch.setattr("legged_mw.deploy.log.read_log", lambda _: elsewhere)
     assert len(replay(logged[0]).simulated["target"]) == 130
     elsewhere = replace(elsewhere, files={})
     with pytest.raises(ContractError, match=f"no policy.yaml in {tmp_path}"):

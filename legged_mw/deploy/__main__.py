@@ -11,10 +11,8 @@ from typing import Any
 from legged_mw import ROOT
 from legged_mw.deploy import drive, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, edits, read_contract
-from legged_mw.deploy.drive import lift
 from legged_mw.deploy.exam import SwitchStage, contract_rules, contract_skill, run
 from legged_mw.deploy.odometry import CONTACTS
-from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import walking
@@ -97,11 +95,6 @@ def driver(name: str) -> Any:
     return import_module(f"legged_mw.{name}.driver")
 
 
-def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
-    """Serve a simulated robot on the wire."""
-    print(driver(args.serve).serve(folder, contract, args, lift(args)))
-
-
 def contact_source(args: argparse.Namespace, contract: Contract) -> str | None:
     """The source of foot contact for leg odometry; None without odometry. Raises RobotError."""
     if args.velocity != ODOMETRY:
@@ -112,11 +105,6 @@ def contact_source(args: argparse.Namespace, contract: Contract) -> str | None:
             f"--contact {args.contact}: this robot does not measure it; there are: {', '.join(CONTACTS[1:])}"
         )
     return args.contact or CONTACTS[not feels]
-
-
-def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> Robot:
-    """Connect to the robot on the wire."""
-    return driver(args.robot).connect(folder, contract, args, odometry=args.velocity == ODOMETRY)
 
 
 RESULT_FILE = "exam.json"
@@ -191,13 +179,12 @@ def _refuse(parser: Parser, args: argparse.Namespace) -> None:
     others = [f"--{name}" for name in ("eval", "drive", "serve", "terrain", "velocity", "scene") if getattr(args, name)]
     if args.switch and (others := others + ["--robot"] * (args.robot != "simulated")):
         parser.error(f"--switch is for simulation on flat ground: leave {others[0]} out")
-    if args.ranges and not args.eval:
-        parser.error("--ranges is for the exam: add --eval")
     apart = [f"--{name}" for name in ("drive", "serve", "terrain", "velocity", "replay") if getattr(args, name)]
     if args.scene and (apart := apart + ["--robot"] * (args.robot != "simulated")):
         parser.error(f"--scene simulates a robot in your own scene: leave {apart[0]} out")
-    if args.no_hard and not args.eval:
-        parser.error("--no_hard is for the exam: add --eval")
+    for name in ("ranges", "no_hard"):
+        if getattr(args, name) and not args.eval:
+            parser.error(f"--{name} is for the exam: add --eval")
     if args.command is not None and args.commands:
         parser.error("--commands has its own commands: leave --command out")
 
@@ -222,24 +209,16 @@ def main() -> None:
         stage = SwitchStage(folder, find(args.second), args.num_envs, command, args.edited)
         launch.watch(stage, args, results(folder), title=f"{contract.task}, {args.second}")
     elif args.serve:
-        serve(folder, contract, args)
+        print(driver(args.serve).serve(folder, contract, args, drive.lift(args)))
     elif args.robot != "simulated":
-        join = partial(connect, folder, contract, args)
+        join = partial(driver(args.robot).connect, folder, contract, args, odometry=args.velocity == ODOMETRY)
         print(drive.drive(join, folder, contract, args, command, args.robot, contact).report)
     elif args.drive:
         hoisted, raised = drive.hoisted(args, contract), drive.lift(args)
         robot = partial(MujocoRobot, folder, contract, inside, whole=True, hoisted=hoisted, lift=raised)
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
-        examine(
-            folder,
-            Path(args.out) if args.out else results(folder) / result_file(args.scene),
-            args.ranges == "common",
-            contact,
-            args.edited,
-            hard=not args.no_hard,
-            scene=scene_file,
-        )
+        examine(folder, contract, args, contact, scene_file)
     else:
         stage = DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact, edited=args.edited)
         launch.watch(stage, args, results(folder), title=contract.task)
@@ -260,11 +239,6 @@ def results(folder: Path) -> Path:
     return Path("logs", folder.name, "shipped") if folder.resolve().parent == SHIPPED.resolve() else folder
 
 
-def result_file(scene: str | None) -> str:
-    """The file of the exam: by the scene's name in a scene of the user's."""
-    return f"exam_{Path(scene).stem}.json" if scene else RESULT_FILE
-
-
 def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
     """Compare a log with its simulation: print the table and write a plot beside the log."""
     replayed = replay.replay(path, folder, edited)
@@ -273,29 +247,19 @@ def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
     print(f"written to {shown(path.with_suffix('.png'))}")
 
 
-def examine(
-    folder: Path,
-    path: Path,
-    common: bool = False,
-    contact: str | None = None,
-    edited: bool = False,
-    hard: bool = True,
-    scene: str | Path = SCENE_FILE,
-) -> None:
-    """Run the exam: print its table and write a JSON file to ``path``. ``contact`` and ``edited``: see DeployStage.
-
-    ``hard``: heat and power too, and of a policy that walks the hard exam. ``scene``: ``scene_file`` of DeployStage.
-    """
-    contract = read_contract(folder, edited)
+def examine(folder: Path, contract: Contract, args: argparse.Namespace, contact: str | None, scene: str | Path) -> None:
+    """Run the exam: print its tables and write a JSON file. ``contact``, ``scene`` (``scene_file``): see DeployStage."""
+    name = f"exam_{Path(args.scene).stem}.json" if args.scene else RESULT_FILE
+    path = Path(args.out) if args.out else results(folder) / name
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
-        given = {"--ranges": common, "--velocity odometry": contact, "--scene": isinstance(scene, Path)}
+        given = {"--ranges": args.ranges == "common", "--velocity odometry": contact, "--scene": args.scene}
         for flag in (flag for flag, value in given.items() if value):
             raise UserError(f"{flag} needs the walking exam, and this policy has another: leave it out")
         rules: walking.ExamRules | Skill = contract_skill(contract)
     else:
-        rules = contract_rules(contract, common)
-    result, _ = run(folder, rules, hard, edited=edited, scene=scene, contact=contact, show=print)
+        rules = contract_rules(contract, args.ranges == "common")
+    result, _ = run(folder, rules, not args.no_hard, edited=args.edited, scene=scene, contact=contact, show=print)
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"scene": shown(scene)} if isinstance(scene, Path) else {}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}
