@@ -199,8 +199,8 @@ def test_the_simulation_of_a_simulated_walk_is_like_it(
     # it began 2 cm above the ground
     np.testing.assert_allclose(robot["torque"].sum(), simulated["torque"].sum(), rtol=0.25)
     np.testing.assert_allclose(robot["velocity"], simulated["velocity"], atol=0.08)
-    limits = Limits.of(GO2, contract)
-    assert (found.simulated["target"] <= limits.highest).all() and (found.simulated["target"] >= limits.lowest).all()
+    action = contract.action
+    assert (found.simulated["target"] <= action.highest).all() and (found.simulated["target"] >= action.lowest).all()
     # a period, at whose end is measured
     np.testing.assert_allclose([robot["latency"], simulated["latency"]], 20.0, atol=1.0)
     text = table(found)

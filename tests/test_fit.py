@@ -296,7 +296,7 @@ def test_sweeps_keep_the_contracts_limits() -> None:
         sweeps = Chirp(Controller(GO2, fast), [], lambda _: None, robot, limits)
         for joint in range(12):
             targets = CONTRACT.default_pose[joint] + sweeps.targets(joint)
-            assert limits.lowest[joint] < targets.min() < targets.max() < limits.highest[joint]
+            assert contract.action.lowest[joint] < targets.min() < targets.max() < contract.action.highest[joint]
             assert CONTRACT.stiffness[joint] * np.abs(sweeps.targets(joint)).max() < 0.5 * limits.motor[joint]
             assert np.abs(np.diff(targets)).max() < STEP * chirp.FASTEST * 1.5
     with pytest.raises(RobotError, match="a measurement every few ms"):

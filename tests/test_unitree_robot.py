@@ -212,11 +212,11 @@ def test_a_contract_in_another_order_sends_the_same(domain: int) -> None:
 def test_targets_are_held_within_what_was_trained(domain: int) -> None:
     """The scene's servos hold targets within the joints' ranges, so the policy may ask for more than a joint can do; drives would obey."""
     both = pair("g1_flat", domain)
-    low, high = both.safety.limits.lowest, both.safety.limits.highest
+    low, high = both.contract.action.lowest, both.contract.action.highest
     knee = both.contract.joints.index("left_knee_joint")
     assert (low[knee], high[knee]) == (pytest.approx(-0.087267), pytest.approx(2.8798))
     owner = both.robot._owner = Owner()
-    both.robot.write(both.safety.held(np.full(29, -9.0)))
+    both.robot.write(both.contract.action.held(np.full(29, -9.0)))
     sent = WireMessage(LAYOUTS["unitree_hg", "LowCmd_"], owner.sent[0])
     assert np.allclose(sent["motor_cmd.q"][[G1.motors[name] for name in both.contract.joints]], low)
 

@@ -105,7 +105,7 @@ class Chirp(JointCheck):
 
     def _chirp(self, begun: Measurement) -> Moves:
         """Move from the joint check's pose ``begun`` to the plan's pose, then run all sweeps."""
-        begin = np.clip(begun.joint_pos, self._limits.lowest, self._limits.highest)
+        begin = self.controller.contract.action.held(begun.joint_pos)
         count, settle = (round(seconds / self.controller.contract.period) for seconds in (MOVE, SETTLE))
         for step in range(count + settle):
             yield self._held(begin + min(1.0, (step + 1) / count) * (self.plan.pose - begin))
@@ -152,7 +152,7 @@ def plan(contract: Contract, scene: DeployScene, limits: Limits) -> ChirpPlan:
     mujoco.mj_fullM(scene.model, data, inertia)
     own = np.sqrt(contract.stiffness / np.diag(inertia)[scene.dofs]) / (2.0 * math.pi)
     highest = np.clip(ABOVE * own, *RANGE)
-    low, high = np.maximum(limits.low, limits.lowest), np.minimum(limits.high, limits.highest)
+    low, high = np.maximum(limits.low, contract.action.lowest), np.minimum(limits.high, contract.action.highest)
     pose, most = contract.default_pose, np.minimum(AMPLITUDE, TORQUE * limits.motor / contract.stiffness)
     amplitude = np.minimum(most, np.maximum(ROOM * np.minimum(pose - low, high - pose), 0.0))
     limbs = _limbs(scene.model, contract.joints)

@@ -343,7 +343,7 @@ class FirstWalk(JointCheck):
         walked.stands.append(self._odometry.stands(measured, self._odometry.legs(measured))[0])
         self.controller.act(measured, self._walk_command)
         targets = self.controller.last_targets[0].copy()
-        clipped = np.clip(targets, self._limits.lowest, self._limits.highest)
+        clipped = self.controller.contract.action.held(targets)
         walked.requested.append(self.controller.contract.stiffness * (clipped - measured.joint_pos))
         return (yield Order(POLICY, targets))
 

@@ -103,8 +103,7 @@ class JointCheck(States):
     # ---- motions: generators that receive measurements and yield orders
 
     def _check(self, measured: Measurement) -> Moves:
-        limits, ones = self._limits, np.ones(len(self.joints))
-        pose = np.clip(measured.joint_pos, limits.lowest, limits.highest)
+        ones, pose = np.ones(len(self.joints)), self.controller.contract.action.held(measured.joint_pos)
         settle = round(SETTLE / self.controller.contract.period)
         for step in range(settle):
             measured = yield self._order(pose, ones * (step + 1) / settle)
@@ -121,8 +120,8 @@ class JointCheck(States):
 
     def _one(self, joint: int, pose: Floats) -> Moves:
         """Move a joint by STEP, hold it, and move it back. It moves by -STEP near its upper limit."""
-        contract, limits, gains, targets = self.controller.contract, self._limits, np.ones(len(pose)), pose.copy()
-        top = min(limits.high[joint], limits.highest[joint])
+        contract, gains, targets = self.controller.contract, np.ones(len(pose)), pose.copy()
+        top = min(self._limits.high[joint], contract.action.highest[joint])
         step = STEP if pose[joint] + STEP <= top else -STEP
         self._tell(f"{self.joints[joint]}{self._motor(joint, ' (motor {})')} goes {step:+.2f} rad")
         ramp, soft, hold, rest = (round(seconds / contract.period) for seconds in (RAMP, SOFTLY, HOLD, REST))

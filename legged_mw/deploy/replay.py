@@ -19,7 +19,6 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.log import DriveLog, LogError, logged_export
 from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.robot import QUANTITIES, Floats
-from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import MujocoRobot, place
 from legged_mw.deploy.states import POLICY, STATES
 from legged_mw.utils.commands import VELOCITY
@@ -64,18 +63,14 @@ def _longest(on: Any) -> slice:
 
 def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
     """Simulate the same commands until the robot falls."""
-    robot, controller, safety = (
-        MujocoRobot(folder, contract),
-        Controller(folder, contract),
-        Safety(contract, Limits.of(folder, contract)),
-    )
+    robot, controller = MujocoRobot(folder, contract), Controller(folder, contract)
     _pose(robot, {name: rows[name][0] for name in ("joint_pos", "joint_vel", "gravity", "lin_vel", "ang_vel")})
     simulated: dict[str, list[Floats]] = {name: [] for name in (*QUANTITIES, "target")}
     for command in rows["command"]:
         measured = robot.read()
         if robot.fell():
             break
-        targets = safety.held(controller.act(measured, contract.held(command))[0])
+        targets = controller.act(measured, contract.held(command))[0]
         for name in QUANTITIES:
             simulated[name].append(getattr(measured, name))
         simulated["target"].append(targets)

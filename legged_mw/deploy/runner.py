@@ -153,7 +153,7 @@ class _Step:
                 order = order._replace(stiffness=None, damping=None)
             if order.targets is not None:
                 trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
-                clipped = self.safety.held(order.targets)
+                clipped = self.controller.contract.action.held(order.targets)
                 order = self._trip(trip, loop.now) if trip else order._replace(targets=clipped)
         self._do(order)
         if self.log and measured:

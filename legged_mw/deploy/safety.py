@@ -54,7 +54,7 @@ class Tripped(RobotError):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of D joints in the contract's order. The first five come from the scene and the contract.
+    """Limits of D joints in the contract's order. The first three come from the scene.
 
     A default without a source is ours: the largest value of the ten shipped policies that walk, in the walking exam
     with the pushes of its mark (in brackets, 2026-11-29), plus a margin. A robot's class or a contract can set tighter
@@ -64,9 +64,6 @@ class Limits:
     low: Floats  # (D,) [rad] range of the joints
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] largest torque of the motors
-    # (D,) [rad] range of the targets in the contract; `held` clips to it as training does, because drives do not
-    lowest: Floats
-    highest: Floats  # (D,) [rad]
     position: float = 0.25  # [rad] measured angle beyond the range [0.23: simulated joint limits are soft]
     target: float = 0.9  # [rad] target beyond the range [0.59]
     step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.99]
@@ -140,7 +137,7 @@ def limits_of(model: Any, contract: Contract) -> Limits:
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
     servo = np.where(model.actuator_forcelimited[servos] > 0, model.actuator_forcerange[servos, 1], OFF)
     joint = np.where(model.jnt_actfrclimited[joints] > 0, model.jnt_actfrcrange[joints, 1], OFF)
-    return Limits(low, high, np.minimum(servo, joint), contract.action.lowest, contract.action.highest)
+    return Limits(low, high, np.minimum(servo, joint))
 
 
 class _Signals(NamedTuple):
@@ -196,10 +193,6 @@ class Safety:
             or self._heard(health, now)
         )
 
-    def held(self, targets: Floats) -> Floats:
-        """Clip ``targets`` (D,) to the contract's range of the targets."""
-        return np.clip(targets, self.limits.lowest, self.limits.highest)
-
     def asked(
         self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None
     ) -> Trip | None:
@@ -216,7 +209,8 @@ class Safety:
             return self._most("torque", text, np.abs(targets), limits.torque * limits.motor)
         stiffness = contract.stiffness if stiffness is None else stiffness
         damping = contract.damping if damping is None else damping
-        torque = np.abs(stiffness * (self.held(targets) - measured.joint_pos) - damping * measured.joint_vel)
+        held = contract.action.held(targets)
+        torque = np.abs(stiffness * (held - measured.joint_pos) - damping * measured.joint_vel)
         step = np.zeros_like(targets) if self._last is None else np.abs(targets - self._last)
         trip = (
             self._range("target", "is told to go to", targets, limits.target)
@@ -228,7 +222,7 @@ class Safety:
             )
             or self._most("torque", text, torque, limits.torque * limits.motor)
         )
-        self._last, self._held = np.array(targets), self.held(targets)
+        self._last, self._held = np.array(targets), held
         return trip
 
     # ---- one method per limit. NaN exceeds a limit.

@@ -31,7 +31,7 @@ _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "ac
 class UnitreeRobot(Robot):
     """A Go2, G1 or H1. Its motors apply the contract's stiffness and damping at their own rate.
 
-    Targets are sent unchanged: ``Safety.held`` clips them to the servos' ranges, for every robot.
+    Targets are sent unchanged: ``Action.held`` clips them to the servos' ranges, for every robot.
     """
 
     can_change_gains, step = True, STEP

@@ -245,9 +245,9 @@ class SimulatedUnitree:
         )
         if (stiff := acted["kp"] > 0.0).any():
             record.asked = max(record.asked, float((np.abs(torque) / limits.motor).max()))
-            record.outside = max(
-                record.outside, _outside(acted["q"][stiff], limits.lowest[stiff], limits.highest[stiff])
-            )
+            action = self.contract.action
+            outside = _outside(acted["q"][stiff], action.lowest[stiff], action.highest[stiff])
+            record.outside = max(record.outside, outside)
         record.drive(self.time, acted)
 
     def _plugs(self) -> tuple[Any, Any]:
