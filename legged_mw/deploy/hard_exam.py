@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
@@ -23,7 +22,9 @@ from legged_mw.eval import hard
 from legged_mw.eval.hard import CONDITIONS, NOISE, Walk
 from legged_mw.eval.walking import GRAVITY, ExamRules
 from legged_mw.utils.commands import VELOCITY
-from legged_mw.view.posed_robot import lowest_point
+from legged_mw.view.posed_robot import lowest_point, show_groups
+from legged_mw.view.recorder import as_png, contact_sheet, make_renderer
+from legged_mw.view.stage import ViewError
 
 LOOK_SECONDS = 10.0  # [s] duration of the gait measurement, with the settling time
 PICTURES, WIDTH, HEIGHT = 6, 240, 260  # number of pictures of one stride; [px] size of each
@@ -263,34 +264,20 @@ VIEWS = {"side": 90.0, "front": 180.0}  # [deg] azimuth of the camera: at the ro
 
 def strip_png(folder: Path, poses: Sequence[Floats]) -> bytes:
     """A PNG of one stride: a row from the side and a row from the front. Empty without poses or OpenGL."""
-    from legged_mw.view.recorder import contact_sheet, save_png  # imports OpenGL
-    from legged_mw.view.stage import ViewError
-
     if not poses:
         return b""
     try:
-        frames = _frames(compile_scene(folder / SCENE_FILE), poses)
+        return as_png(contact_sheet(_frames(compile_scene(folder / SCENE_FILE), poses), PICTURES))
     except ViewError as error:
         print(f"no strip of pictures: {error}")
         return b""
-    with TemporaryDirectory() as temp:
-        save_png(path := Path(temp) / "strip.png", contact_sheet(frames, PICTURES))
-        return path.read_bytes()
 
 
 def _frames(model: mujoco.MjModel, poses: Sequence[Floats]) -> list[NDArray[np.uint8]]:
     """One picture per pose and view of VIEWS. Raises ViewError."""
-    from legged_mw.view.posed_robot import show_groups
-    from legged_mw.view.recorder import no_context
-    from legged_mw.view.stage import ViewError
-
     data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()
     show_groups(option)
-    model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
-    try:
-        renderer = mujoco.Renderer(model, height=HEIGHT, width=WIDTH)
-    except Exception as error:  # the type depends on the OpenGL backend
-        raise ViewError(no_context(error)) from error
+    renderer = make_renderer(model, WIDTH, HEIGHT)
     data.qpos[:] = poses[0]
     mujoco.mj_forward(model, data)
     robot = np.flatnonzero(model.geom_bodyid)

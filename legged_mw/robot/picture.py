@@ -20,8 +20,8 @@ from legged_mw.sim.joints import family
 from legged_mw.sim.model import RobotModel
 from legged_mw.view.overlay import connect, draw_disc
 from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots, boxes, patch
-from legged_mw.view.recorder import Frame, no_context, save_png
-from legged_mw.view.stage import FloatArray, ViewError
+from legged_mw.view.recorder import Frame, make_renderer, save_png
+from legged_mw.view.stage import FloatArray
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
 VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]
@@ -90,13 +90,7 @@ class _Picture:
         self.posed.pose(qpos)
         self._paint()
         self._measure()
-        vis = self.posed.model.vis
-        vis.global_.offwidth, vis.global_.offheight = WIDTH, HEIGHT
-        try:
-            font = mujoco.mjtFontScale.mjFONTSCALE_150
-            self._renderer = mujoco.Renderer(self.posed.model, height=HEIGHT, width=WIDTH, font_scale=font)
-        except Exception as error:  # each OpenGL backend raises another type
-            raise ViewError(no_context(error)) from error
+        self._renderer = make_renderer(self.posed.model, WIDTH, HEIGHT)
 
     def close(self) -> None:
         self._renderer.close()

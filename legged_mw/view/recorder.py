@@ -56,21 +56,15 @@ class RobotRenderer:
         vis = self.robots.model.vis
         if live:
             vis.quality.offsamples, vis.quality.numslices, vis.quality.numstacks = LIVE
-        vis.global_.offwidth, vis.global_.offheight = width, height
         vis.quality.shadowsize = min(vis.quality.shadowsize, SHADOW_MAX)
         self.width, self.height = width, height
         self._camera = RobotCamera(mujoco.MjvCamera(), self.robots, by_hand=live)
         self._option = mujoco.MjvOption()
         show_groups(self._option)
-        try:
-            font = mujoco.mjtFontScale.mjFONTSCALE_150
-            if width <= SMALL:
-                font = mujoco.mjtFontScale.mjFONTSCALE_50 if width <= TINY else mujoco.mjtFontScale.mjFONTSCALE_100
-            self._renderer = mujoco.Renderer(
-                self.robots.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font
-            )
-        except Exception as error:  # each OpenGL backend raises another type
-            raise ViewError(no_context(error)) from error
+        font = mujoco.mjtFontScale.mjFONTSCALE_150
+        if width <= SMALL:
+            font = mujoco.mjtFontScale.mjFONTSCALE_50 if width <= TINY else mujoco.mjtFontScale.mjFONTSCALE_100
+        self._renderer = make_renderer(self.robots.model, width, height, font, GEOMS_MAX)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = not live
 
     def move_camera(self, action: int, x: float, y: float) -> None:
@@ -105,14 +99,24 @@ class RobotRenderer:
         self._renderer.close()
 
 
-def no_context(error: Exception) -> str:
-    """The advice for a machine without an OpenGL context for offscreen drawing."""
-    state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
-    return (
-        f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"
-        "Without a display set MUJOCO_GL=egl (NVIDIA driver or Mesa's libegl1) or MUJOCO_GL=osmesa (libosmesa6, slower) "
-        "in the shell, before Python starts."
-    )
+def make_renderer(
+    model: mujoco.MjModel,
+    width: int,
+    height: int,
+    font: mujoco.mjtFontScale = mujoco.mjtFontScale.mjFONTSCALE_150,
+    geoms: int = 10_000,
+) -> mujoco.Renderer:
+    """A renderer of pictures without a screen. Raises ViewError if this machine has no OpenGL context for it."""
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    try:
+        return mujoco.Renderer(model, height=height, width=width, max_geom=geoms, font_scale=font)
+    except Exception as error:  # each OpenGL backend raises another type
+        state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
+        raise ViewError(
+            f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"
+            "Without a display set MUJOCO_GL=egl (NVIDIA driver or Mesa's libegl1) or MUJOCO_GL=osmesa (libosmesa6, slower) "
+            "in the shell, before Python starts."
+        ) from error
 
 
 class Recorder:
@@ -317,8 +321,8 @@ def contact_sheet(frames: Sequence[Frame], columns: int) -> Frame:
     return sheet.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
 
 
-def save_png(path: Path | str, frame: Frame) -> None:
-    """Write one frame as an RGB PNG. Needs neither Pillow nor PyAV, which a robot's computer lacks."""
+def as_png(frame: Frame) -> bytes:
+    """One frame as an RGB PNG. Needs neither Pillow nor PyAV, which a robot's computer lacks."""
 
     def chunk(tag: bytes, body: bytes) -> bytes:
         return struct.pack(">I", len(body)) + tag + body + struct.pack(">I", zlib.crc32(tag + body))
@@ -326,6 +330,11 @@ def save_png(path: Path | str, frame: Frame) -> None:
     height, width = frame.shape[:2]
     rows = np.hstack([np.zeros((height, 1), dtype=np.uint8), np.ascontiguousarray(frame).reshape(height, width * 3)])
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
     body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
-    Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def save_png(path: Path | str, frame: Frame) -> None:
+    """Write one frame as a PNG."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_bytes(as_png(frame))
