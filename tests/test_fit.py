@@ -83,7 +83,7 @@ class OneSlot(Chirp):
     def _check(self, measured: Measurement) -> Moves:
         self.state = CHIRP
         for _ in range(100):
-            yield self._held(self.plan.pose)
+            yield self._order(self.plan.pose)
         names = self.controller.contract.joints
         (slot,) = (slot for slot in self.plan.slots if names.index(self.swept) in slot)
         assert {names[joint] for joint in slot} == self.together

@@ -76,7 +76,7 @@ class Chirp(JointCheck):
     ) -> None:
         """Raises RobotError if the robot cannot change its gains."""
         super().__init__(controller, sources, say, robot, limits)
-        self._now, self._swept = 0.0, 0
+        self._swept = 0
         self.plan = plan(controller.contract, self._scene, limits)
         ratings = controller.contract.ratings
         top = SPEED * ratings.top_speed if ratings else np.full(len(self.joints), np.nan)
@@ -91,16 +91,11 @@ class Chirp(JointCheck):
     def report(self) -> str:
         return f"{super().report}\n{self._swept} of {len(self.joints)} joints swept"
 
-    def step(self, measured: Measurement, now: float) -> Order:
-        self._now = now
-        return super().step(measured, now)
-
     def _check(self, measured: Measurement) -> Moves:
         yield from super()._check(measured)
         if super().right:
-            self._enter(
-                CHIRP, self._now, "the joints follow sines of rising frequency, one joint of each limb at a time"
-            )
+            note = "the joints follow sines of rising frequency, one joint of each limb at a time"
+            self._enter(CHIRP, self._now, note)
             yield from self._chirp(measured)
 
     def _chirp(self, begun: Measurement) -> Moves:
@@ -108,7 +103,7 @@ class Chirp(JointCheck):
         begin = self.controller.contract.action.held(begun.joint_pos)
         count, settle = (round(seconds / self.controller.contract.period) for seconds in (MOVE, SETTLE))
         for step in range(count + settle):
-            yield self._held(begin + min(1.0, (step + 1) / count) * (self.plan.pose - begin))
+            yield self._order(begin + min(1.0, (step + 1) / count) * (self.plan.pose - begin))
         for slot in self.plan.slots:
             yield from self._sweep(slot)
             self._swept += len(slot)
@@ -119,7 +114,7 @@ class Chirp(JointCheck):
         for targets in signs * np.stack([self.targets(joint) for joint in slot], axis=1):
             pose = self.plan.pose.copy()
             pose[slot] += targets
-            yield self._held(pose)
+            yield self._order(pose)
 
     def targets(self, joint: int) -> Floats:
         """Targets (T,) [rad] of a joint's sweep about its pose."""
@@ -131,10 +126,6 @@ class Chirp(JointCheck):
         size = np.minimum(self.plan.amplitude[joint], self._speed[joint] / frequency)
         fade = np.clip(np.minimum(time, time[-1] - time) / FADE, 0.0, 1.0)
         return np.pad(fade * size * np.sin((frequency - frequency[0]) / rate), (rest, rest))
-
-    def _held(self, targets: Floats) -> Order:
-        contract = self.controller.contract
-        return Order(CHIRP, targets, contract.stiffness, contract.damping)
 
 
 # ---- the plan

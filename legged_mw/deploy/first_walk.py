@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,12 +81,12 @@ class Differs(Exception):
 class _Walked:
     """Measurements since the command changed, one entry per control period."""
 
-    torque: list[Floats]  # (D,) [N m]
-    requested: list[Floats]  # (D,) [N m] stiffness x position error
-    tilt: list[float]  # [rad]
-    turn: list[float]  # [rad/s] about the body's z axis
-    velocity: list[Floats]  # (2,) [m/s] by leg odometry, body frame
-    stands: list[Any]  # (F,) feet on the ground
+    torque: list[Floats] = field(default_factory=list)  # (D,) [N m]
+    requested: list[Floats] = field(default_factory=list)  # (D,) [N m] stiffness x position error
+    tilt: list[float] = field(default_factory=list)  # [rad]
+    turn: list[float] = field(default_factory=list)  # [rad/s] about the body's z axis
+    velocity: list[Floats] = field(default_factory=list)  # (2,) [m/s] by leg odometry, body frame
+    stands: list[Any] = field(default_factory=list)  # (F,) feet on the ground
 
     @property
     def steps(self) -> float:
@@ -124,8 +124,8 @@ class FirstWalk(JointCheck):
         self._robot, self._exam, self._odometry = robot, exam, Odometry(controller.folder, contract, 1, "torque")
         self.values, self.found = list[Value](), dict[tuple[str, str], Floats]()
         self.at, self.wants, self.ended = HANGING, "", ""  # step; next button; why the walk ended
-        self._walk_command, self._now, self._steps = self._velocity(), 0.0, self._all()
-        self._walked, self._judged = _Walked([], [], [], [], [], []), 0
+        self._walk_command, self._steps = self._velocity(), self._all()
+        self._walked, self._judged = _Walked(), 0
         next(self._steps)
 
     @property
@@ -319,7 +319,7 @@ class FirstWalk(JointCheck):
 
         Raises Differs if the time limit is reached.
         """
-        self._walk_command, self._walked = command, _Walked([], [], [], [], [], [])
+        self._walk_command, self._walked = command, _Walked()
         exam = None if self._exam is None or not timed else self._exam[self.at, timed]
         longest = LONGEST if exam is None else PATIENCE * float(exam[0])
         while not (self._walked.tilt and done()):
@@ -420,7 +420,7 @@ def _tilt(measured: Measurement) -> float:
 # ---- the exam's robot
 
 
-class _ButtonPresser:
+class _ButtonPresser(InputSource):
     """An input source that presses the next button at once."""
 
     def __init__(self) -> None:
@@ -429,10 +429,6 @@ class _ButtonPresser:
     def poll(self, health: Health) -> DriveInput:
         wants = self.walk.wants if self.walk else ""
         return DriveInput(frozenset({wants} - {"", STOP}), stop="the exam's" if wants == STOP else "")
-
-    def let_go(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 def first_walk(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, make_ratings, read_contract
+from legged_mw.deploy.contract import SCENE_FILE, Ends, make_ratings, read_contract
 from legged_mw.deploy.hard_exam import commands_of
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Fleet
@@ -83,7 +83,7 @@ class MotorLog:
 def walk(stage: DeployStage, log: MotorLog, vx: float, holds: bool) -> tuple[dict[str, Motion | None], Switch | None]:
     """Let the servos hold the default pose (if ``holds``), then let the policy stand, then walk at ``vx`` [m/s]."""
     stand, forward = (commands_of(stage.contract, [(speed, 0.0, 0.0)]) for speed in (0.0, vx))
-    switch = switch_over(stage, log, stage.contract, stand) if holds else None
+    switch = switch_over(stage, log, stand) if holds else None
     motions: dict[str, Motion | None] = {}
     for name, command in (("standing", stand), ("walking", forward)):
         fell = _run(stage, SETTLING, command)
@@ -92,12 +92,12 @@ def walk(stage: DeployStage, log: MotorLog, vx: float, holds: bool) -> tuple[dic
     return motions, switch
 
 
-def switch_over(stage: DeployStage, log: MotorLog, contract: Contract, stand: Floats) -> Switch | None:
+def switch_over(stage: DeployStage, log: MotorLog, stand: Floats) -> Switch | None:
     """Hold the default pose for STAND, then start the policy. None if the robot falls after that.
 
     Before the policy starts, the root can only move vertically, as if a person held it. Otherwise a biped falls.
     """
-    fleet, start = stage.fleet, stage.qpos()[0]
+    fleet, contract, start = stage.fleet, stage.contract, stage.qpos()[0]
     for _ in range(round(STAND / stage.dt)):
         fleet.write(contract.default_pose[None])
         fleet.qpos[0, [0, 1, 3, 4, 5, 6]] = start[[0, 1, 3, 4, 5, 6]]

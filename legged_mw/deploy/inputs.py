@@ -38,7 +38,7 @@ class DriveInput(NamedTuple):
 
 
 class InputSource(Protocol):
-    """The interface of an input source."""
+    """An input source. By default it gives no command of its own and holds nothing open."""
 
     def poll(self, health: Health) -> DriveInput:
         """The input since the last call."""
@@ -67,7 +67,7 @@ def from_sticks(remote: Remote, table: Sequence[Command]) -> Floats | None:
     return command if moved else None
 
 
-class RobotRemote:
+class RobotRemote(InputSource):
     """The robot's own remote, as `health` reports it."""
 
     name = "the remote"
@@ -77,10 +77,6 @@ class RobotRemote:
 
     def poll(self, health: Health) -> DriveInput:
         return self._wish(health.remote or Remote())
-
-    def let_go(self) -> None: ...
-
-    def close(self) -> None: ...
 
     def _wish(self, remote: Remote) -> DriveInput:
         pressed, self._held = remote.buttons - self._held, remote.buttons
@@ -155,7 +151,7 @@ class Gamepad(RobotRemote):
         (self._buttons.add if down else self._buttons.discard)(button)
 
 
-class Keys:
+class Keys(InputSource):
     """The keys of a terminal or the characters of a pipe. Arrows, q, e, u, j, space and o drive as in the viewers."""
 
     STATES = {"s": START, "a": WALK, "x": END}
@@ -214,7 +210,7 @@ class Keys:
         return keys
 
 
-class StopFile:
+class StopFile(InputSource):
     """Stops the robot when a file descriptor is readable or closed at its other end, for a switch or a watchdog."""
 
     def __init__(self, file: int) -> None:
@@ -227,7 +223,3 @@ class StopFile:
 
     def poll(self, health: Health) -> DriveInput:
         return DriveInput(stop=f"file descriptor {self._file}" if select.select([self._file], [], [], 0)[0] else "")
-
-    def let_go(self) -> None: ...
-
-    def close(self) -> None: ...

@@ -65,7 +65,7 @@ class JointCheck(States):
         rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[JointResult]()
         super().__init__(controller, sources, lambda _: rest, say)
         self.joints, self._limits, self._motors, self._moves = controller.contract.joints, limits, robot.motors, None
-        self._scene = read_scene(controller.folder, controller.contract)
+        self._scene, self._now = read_scene(controller.folder, controller.contract), 0.0
 
     @property
     def over(self) -> bool:
@@ -77,6 +77,7 @@ class JointCheck(States):
         return len(self.rows) == len(self.joints) and all(row.verdict == "right" for row in self.rows)
 
     def step(self, measured: Measurement, now: float) -> Order:
+        self._now = now
         if self._moves is None:
             if self.state != ZERO or START not in self._pressed or END in self._pressed:
                 return super().step(measured, now)
@@ -103,10 +104,10 @@ class JointCheck(States):
     # ---- motions: generators that receive measurements and yield orders
 
     def _check(self, measured: Measurement) -> Moves:
-        ones, pose = np.ones(len(self.joints)), self.controller.contract.action.held(measured.joint_pos)
+        pose = self.controller.contract.action.held(measured.joint_pos)
         settle = round(SETTLE / self.controller.contract.period)
         for step in range(settle):
-            measured = yield self._order(pose, ones * (step + 1) / settle)
+            measured = yield self._order(pose, (step + 1) / settle)
             if np.abs(error := measured.joint_pos - pose).max() > FAR:
                 joint = int(np.abs(error).argmax())
                 self._tell(
@@ -147,9 +148,10 @@ class JointCheck(States):
             )
         )
 
-    def _order(self, targets: Floats, share: Floats) -> Order:
+    def _order(self, targets: Floats, share: float | Floats = 1.0) -> Order:
+        """Targets with a ``share`` of the contract's stiffness."""
         contract = self.controller.contract
-        return Order(CHECK, targets.copy(), share * contract.stiffness, contract.damping)
+        return Order(self.state, targets.copy(), share * contract.stiffness, contract.damping)
 
     # ---- verdicts
 

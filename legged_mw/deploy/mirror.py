@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.inputs import DriveInput
+from legged_mw.deploy.inputs import DriveInput, InputSource
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.simulated import place, read_scene
 from legged_mw.deploy.states import POLICY, States
@@ -30,7 +30,7 @@ from legged_mw.utils.errors import UserError
 from legged_mw.view import launch
 from legged_mw.view.drive import Pilot
 from legged_mw.view.session import Session, signed
-from legged_mw.view.stage import ViewError
+from legged_mw.view.stage import Stage, ViewError
 
 RATE = 25.0  # [Hz] of frames
 START = 30.0  # [s] time limit for a viewer to open
@@ -43,8 +43,8 @@ FLAGS = ("viewer", "camera", "host", "port")
 LIVE = ("native", "web")  # live values of --viewer
 
 
-class RobotMonitor:
-    """The robot program's side of the view. It is also an input source (``inputs.InputSource``) that can only damp."""
+class RobotMonitor(InputSource):
+    """The robot program's side of the view. As an input source it can only damp."""
 
     def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
         """Open the viewer in ``args`` (see ``launch.add_flags``). Raises ViewError."""
@@ -110,8 +110,6 @@ class RobotMonitor:
         except OSError:
             return DriveInput()
 
-    def let_go(self) -> None: ...
-
     def close(self) -> None:
         self._channel.close()
         self._process.terminate()
@@ -121,8 +119,8 @@ class RobotMonitor:
 # ---- the viewer's process
 
 
-class MirroredStage:
-    """The robot's latest state as a stage (the viewers' protocol ``Stage``). It steps no physics."""
+class MirroredStage(Stage):
+    """The robot's latest state as a stage. It steps no physics."""
 
     num_worlds, dt = 1, 1.0 / RATE
 
@@ -173,14 +171,8 @@ class MirroredStage:
             np.array([[*self.latest.get("lin_vel", [0.0, 0.0])[:2], self.latest.get("ang_vel", [0.0])[-1]]])
         )
 
-    def believed_velocity(self) -> None:
-        return None
-
     def qpos(self) -> Floats:
         return self._data.qpos[None].copy()
-
-    def ghost(self) -> None:
-        return None
 
     def contacts(self) -> Any:
         touches = self.latest.get("foot_contact", [0.0] * len(self.contract.feet))
@@ -188,11 +180,6 @@ class MirroredStage:
 
     def fell(self) -> Any:
         return self.contract.ends.tilted(np.array([self.latest.get("gravity", [0.0, 0.0, -1.0])]))
-
-    def ground(self, world: int) -> str:
-        return ""
-
-    def push(self, world: int, velocity: Floats) -> None: ...
 
     def reset(self, world: int) -> None:
         """Damp the robot. The viewer calls this for its button."""

@@ -15,6 +15,7 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Change, Fleet
+from legged_mw.view.stage import Stage
 
 SCATTER = 0.05  # [rad] largest random change of a joint's start angle [ours]
 STROLL = {"lin_vel_x": 0.5}  # [m/s] default command, because a walking robot shows more than a standing robot
@@ -25,8 +26,8 @@ def idle_command(contract: Contract) -> Floats:
     return contract.held([STROLL.get(command.name, command.default) for command in contract.commands])
 
 
-class DeployStage:
-    """``num_worlds`` robots with an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
+class DeployStage(Stage):
+    """``num_worlds`` robots with an exported policy in MuJoCo's C engine."""
 
     def __init__(
         self,
@@ -107,10 +108,6 @@ class DeployStage:
     def fell(self) -> NDArray[np.bool_]:
         """(N,) true for a fall in the last step."""
         return self._fell.copy()
-
-    def ground(self, world: int) -> str:
-        """Always empty, because a scene has no name for its ground."""
-        return ""
 
     def push(self, world: int, velocity: Any) -> None:
         """Add ``velocity`` (2,) [m/s, world frame] to the base velocity. The policy measures it one step later."""

@@ -25,7 +25,10 @@ class ViewError(UserError, RuntimeError):
 
 
 class Stage(Protocol):
-    """N robots in N separate worlds, with C commands. With C = 0 it cannot be driven. Returned arrays are copies."""
+    """N robots in N separate worlds, with C commands. With C = 0 it cannot be driven. Returned arrays are copies.
+
+    A stage without an estimator, a reference motion, kinds of ground or pushes leaves those methods out.
+    """
 
     spec: mujoco.MjSpec  # one robot with its scene, for drawing
     num_worlds: int
@@ -45,7 +48,7 @@ class Stage(Protocol):
 
     def believed_velocity(self) -> FloatArray | None:
         """The policy's estimate of vx, vy (N, 2) at its last action, as in `velocity`; None without an estimator."""
-        ...
+        return None
 
     def qpos(self) -> FloatArray:
         """Pose of each robot (N, nq), world frame."""
@@ -53,7 +56,7 @@ class Stage(Protocol):
 
     def ghost(self) -> FloatArray | None:
         """The reference pose of each robot (N, nq), world frame; None without a reference motion."""
-        ...
+        return None
 
     def contacts(self) -> BoolArray:
         """Mask (N, G) of the foot geoms in contact, in the order of the model's first G contact sensors."""
@@ -65,7 +68,7 @@ class Stage(Protocol):
 
     def ground(self, world: int) -> str:
         """The kind of ground below a robot as text; empty for a plane."""
-        ...
+        return ""
 
     def push(self, world: int, velocity: FloatArray) -> None:
         """Add `velocity` (2,) [m/s], world frame, to the robot's horizontal velocity."""
