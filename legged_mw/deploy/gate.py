@@ -17,7 +17,7 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from legged_mw.deploy.__main__ import find
+from legged_mw.deploy.__main__ import SHIPPED, find
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, read_contract
 from legged_mw.deploy.exam import contract_rules, contract_skill, run_exam, run_skill
 from legged_mw.deploy.hard_exam import run_hard
@@ -77,8 +77,7 @@ def main(export: Export) -> None:
     before = read_result(typed(args.against)) if args.against else None
     with TemporaryDirectory() as scratch:
         folders = [
-            find_export(name, args.checkpoint) or _exported(export, name, args.checkpoint, Path(scratch, str(i)))
-            for i, name in enumerate(args.policies)
+            find_export(name, args.checkpoint, export, Path(scratch, str(i))) for i, name in enumerate(args.policies)
         ]
         requests = [asked_of(folder, args) for folder in folders]
         for name, other in zip(args.policies[1:], requests[1:], strict=True):
@@ -101,26 +100,18 @@ def main(export: Export) -> None:
         print("no mark fell")
 
 
-def find_export(name: str, checkpoint: int = -1) -> Path | None:
-    """The export folder of ``name``: an export, a run or a shipped policy. None: the run has no export yet."""
+def find_export(name: str, checkpoint: int, export: Export, scratch: Path) -> Path:
+    """The export folder of ``name``: an export, a run or a shipped policy. A run without one is exported to ``scratch``."""
     folder, of_task = typed(name), Path("logs", name)  # a path, or TASK/RUN
     made = [folder / "export", of_task / "export"] if checkpoint == -1 else []  # an export has no checkpoints
     for path in (folder, *made):
         if (path / CONTRACT_FILE).is_file():
             return find(str(path))
-    return None if folder.exists() or of_task.exists() or checkpoint != -1 else _shipped(name)
-
-
-def _shipped(name: str) -> Path | None:
-    try:
-        return find(name)
-    except UserError:  # it may be a run, which the caller exports
-        return None
-
-
-def _exported(export: Export, name: str, checkpoint: int, folder: Path) -> Path:
-    export(name, checkpoint, folder)
-    return folder
+    is_run = folder.exists() or of_task.exists() or checkpoint != -1
+    if not is_run and (SHIPPED / name).is_dir():
+        return SHIPPED / name
+    export(name, checkpoint, scratch)
+    return scratch
 
 
 # ---- exam and robot ---------------------------------------------------------------------------------------------------
