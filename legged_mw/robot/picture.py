@@ -20,7 +20,7 @@ from legged_mw.sim.joints import family
 from legged_mw.sim.model import RobotModel
 from legged_mw.view.overlay import connect, draw_disc
 from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots, boxes, patch
-from legged_mw.view.recorder import Frame, make_renderer, save_png
+from legged_mw.view.recorder import Frame, contact_sheet, make_renderer, save_png, shrunk
 from legged_mw.view.stage import FloatArray
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
@@ -77,8 +77,7 @@ def draw_poses(path: Path, robot: RobotModel, poses: Sequence[tuple[FloatArray, 
         scene.close()
     columns = min(ACROSS, len(tiles))
     tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
-    rows = [np.concatenate(tiles[i : i + columns], axis=1) for i in range(0, len(tiles), columns)]
-    save_png(path, np.concatenate(rows))
+    save_png(path, contact_sheet(tiles, columns))
 
 
 class _Picture:
@@ -113,13 +112,16 @@ class _Picture:
         """The robot from the left side without marks, in half the size, with ``text`` above."""
         self._look(*VIEWS[1][1:], smaller=1.3)
         self._renderer.render()
-        context, rect = self._renderer._mjr_context, self._renderer._rect
+        context = self._renderer._mjr_context
         for number, line in enumerate(textwrap.wrap(text, LETTERS)):
             _text(context, line, 2 * LEFT_COLUMN, 48 + 48 * number, (1.0, 1.0, 1.0), mujoco.mjtFont.mjFONT_BIG)
+        return shrunk(self._read(), WIDTH // 2)
+
+    def _read(self) -> Frame:
+        """The last picture, with what was written over it."""
         frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(frame, None, rect, context)
-        halves = np.flipud(frame).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3)
-        return halves.mean(axis=(1, 3)).astype(np.uint8)
+        mujoco.mjr_readPixels(frame, None, self._renderer._rect, self._renderer._mjr_context)
+        return np.flipud(frame).copy()
 
     def _look(self, azimuth: float, elevation: float, smaller: float = 1.0) -> mujoco.MjvCamera:
         """Make the scene seen from these angles [deg]. ``smaller``: factor on the distance, with space above."""
@@ -203,8 +205,7 @@ class _Picture:
     def _write(self, labels: list[Label], camera: mujoco.MjvCamera, title: str) -> Frame:
         """Write names in two columns over the last picture, and draw their lines. Return the picture."""
         placed = _columns([(label, self._project(label.place, camera)) for label in labels])
-        context, rect = self._renderer._mjr_context, self._renderer._rect
-        lines = []
+        context, lines = self._renderer._mjr_context, []
         for label, (x, y), row, left in placed:
             width = _width(context, label.text)
             start = LEFT_COLUMN if left else WIDTH - LEFT_COLUMN - width
@@ -213,9 +214,7 @@ class _Picture:
         _text(context, title, LEFT_COLUMN, 24, (1.0, 1.0, 1.0))
         for number, part in enumerate(CAPTION.split("   ")):
             _text(context, part, LEFT_COLUMN, HEIGHT - 24 * (4 - number) + 8, (1.0, 1.0, 1.0))
-        frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
-        mujoco.mjr_readPixels(frame, None, rect, context)
-        frame = np.flipud(frame).copy()
+        frame = self._read()
         for start, end, rgb in lines:
             _line(frame, start, end, rgb)
         return frame
