@@ -76,14 +76,6 @@ def _in_scene(
             f"--scene: {file.name} has a time step of {model.opt.timestep:g} s, of which no whole number is the policy's period of "
             f'{contract.period:g} s; write one in it: <option timestep="{contract.timestep:g}"/>'
         )
-    row_sensors = {row.name: row.sensors for row in contract.rows if row.sensors}
-    names = [
-        name for i in range(model.nsensor) if not (name := model.sensor(i).name).startswith(("deploy/", "contact/"))
-    ]
-    for row, wanted in row_sensors.items():
-        for name in wanted:
-            if name not in names:
-                raise UserError(f"--scene: observation row '{row}': {unknown('sensor', name, names, file.name)}")
     return replace(
         contract,
         timestep=float(model.opt.timestep),

@@ -189,11 +189,6 @@ def table() -> Table:
 def of_scenes(made: Table) -> None:
     """--scene: files that do not fit go2_flat, and policies that fit no scene."""
     contract = read_contract(GO2)
-    asks_more = replace(contract.rows[0], name="heat", sensors=("heat/imu",))
-    policies = {
-        "motors with a law": replace(contract, motors=contract.motors._replace(law="torque")),
-        "a sensor of the task's own": replace(contract, rows=(asks_more, *contract.rows[1:])),
-    }
 
     def fits(of: Contract = contract) -> Run:
         return lambda root: fit(root / "vendor.xml", GO2, of)
@@ -202,8 +197,8 @@ def of_scenes(made: Table) -> None:
         made.add(f"scene: {name}", fits(), lambda root, change=change: vendors(root, change))
     for name, text in NO_SCENES.items():
         made.add(f"scene: {name}", fits(), lambda root, text=text: (root / "vendor.xml").write_text(text))
-    for name, of in policies.items():
-        made.add(f"scene: {name}", fits(of), vendors)
+    with_law = replace(contract, motors=contract.motors._replace(law="torque"))
+    made.add("scene: motors with a law", fits(with_law), vendors)
 
 
 LIMITS = [("tlit", 3), ("tilt", "x"), ("tilt", -1), ("tilt", True)]
