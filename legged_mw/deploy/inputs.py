@@ -151,56 +151,27 @@ class Gamepad(RobotRemote):
         (self._buttons.add if down else self._buttons.discard)(button)
 
 
-class Keys(InputSource):
-    """The keys of a terminal or the characters of a pipe. Arrows, q, e, u, j, space and o drive as in the viewers."""
+class TerminalKeys:
+    """The keys of a terminal, one at a time until ``close``, or the characters of a pipe."""
 
-    STATES = {"s": START, "a": WALK, "x": END}
     _ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[D": "left", "\x1b[C": "right"}
-    # the other keys are for a simulation
-    _DRIVE = {key for b in BINDINGS[: ACTIONS.index("own") + 1] for key in b.keys}
 
-    def __init__(self, table: Sequence[Command], file: int | None = None) -> None:
-        """Read from the descriptor ``file`` (None: standard input). A terminal sends single keys until ``close``."""
-        self._file = sys.stdin.fileno() if file is None else file
-        self._pilot, self._closed = Pilot(table), False
+    def __init__(self, file: int | None = None) -> None:
+        """Read from the descriptor ``file`` (None: standard input)."""
+        self._file, self.gone = sys.stdin.fileno() if file is None else file, False
         self._before = termios.tcgetattr(self._file) if os.isatty(self._file) else None
         if self._before is not None:
             tty.setcbreak(self._file)
 
-    def poll(self, health: Health) -> DriveInput:
-        pressed, stop = frozenset[str](), ""
-        for key in self._read():
-            if key == "\x1b":
-                stop = "the emergency stop (key Esc)"
-            elif key in self.STATES:
-                pressed |= {self.STATES[key]}
-            elif key in self._DRIVE:
-                self._pilot.press(key)
-        self._pilot.listen()
-        return DriveInput(
-            pressed,
-            self._pilot.command if self._pilot.driving else None,
-            stop or ("the terminal is gone" if self._closed else ""),
-        )
-
-    def let_go(self) -> None:
-        self._pilot.driving, self._pilot.command = False, self._pilot.default.copy()
-
-    def close(self) -> None:
-        if self._before is not None:
-            with contextlib.suppress(OSError, termios.error):
-                termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
-        self._before = None
-
-    def _read(self) -> list[str]:
+    def read(self) -> list[str]:
         """The names of the keys pressed since the last call."""
         text = ""
-        while not self._closed and select.select([self._file], [], [], 0)[0]:
+        while not self.gone and select.select([self._file], [], [], 0)[0]:
             try:
                 data = os.read(self._file, 256)
             except OSError:
                 data = b""
-            self._closed = not data
+            self.gone = not data
             text += data.decode("utf-8", "replace")
         keys = []
         while text:
@@ -208,6 +179,44 @@ class Keys(InputSource):
             key, text = text[:length], text[length:]
             keys.append(self._ARROWS.get(key, {" ": "space"}.get(key, key)))
         return keys
+
+    def close(self) -> None:
+        """Restore the terminal."""
+        if self._before is not None:
+            with contextlib.suppress(OSError, termios.error):
+                termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
+        self._before = None
+
+
+class Keys(InputSource):
+    """The keys of a terminal. Arrows, q, e, u, j, space and o drive as in the viewers."""
+
+    STATES = {"s": START, "a": WALK, "x": END}
+    # the other keys are for a simulation
+    _DRIVE = {key for b in BINDINGS[: ACTIONS.index("own") + 1] for key in b.keys}
+
+    def __init__(self, table: Sequence[Command], file: int | None = None) -> None:
+        """``file``: see TerminalKeys."""
+        self._keys, self._pilot = TerminalKeys(file), Pilot(table)
+
+    def poll(self, health: Health) -> DriveInput:
+        pressed, stop = frozenset[str](), ""
+        for key in self._keys.read():
+            if key == "\x1b":
+                stop = "the emergency stop (key Esc)"
+            elif key in self.STATES:
+                pressed |= {self.STATES[key]}
+            elif key in self._DRIVE:
+                self._pilot.press(key)
+        self._pilot.listen()
+        command = self._pilot.command if self._pilot.driving else None
+        return DriveInput(pressed, command, stop or ("the terminal is gone" if self._keys.gone else ""))
+
+    def let_go(self) -> None:
+        self._pilot.driving, self._pilot.command = False, self._pilot.default.copy()
+
+    def close(self) -> None:
+        self._keys.close()
 
 
 class StopFile(InputSource):

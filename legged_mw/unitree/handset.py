@@ -12,13 +12,11 @@ Positive sticks: ahead (ly, ry) and right (lx, rx).
 from __future__ import annotations
 
 import math
-import os
-import select
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from legged_mw.deploy.inputs import TerminalKeys
 from legged_mw.deploy.robot import BUTTONS
 from legged_mw.unitree.codec import encode_remote
 from legged_mw.utils.config import ConfigError, load_yaml
@@ -90,13 +88,7 @@ class Handset:
         self._sticks: dict[str, float] = dict.fromkeys(STICKS, 0.0)
         self._buttons, self._until = tuple[str, ...](), -math.inf
         self.off, self.hoist = False, None  # None: no input has set it
-        self._keys, self._before = keys, None
-        if keys:
-            import termios
-            import tty
-
-            self._before = termios.tcgetattr(sys.stdin)
-            tty.setcbreak(sys.stdin)
+        self._keys = TerminalKeys() if keys else None
 
     def state(self, time: float) -> bytes:
         """The remote's 40 bytes at ``time`` [s], which must not decrease."""
@@ -107,9 +99,8 @@ class Handset:
             self.hoist = self.hoist if entry.hoist is None else entry.hoist
             if entry.press:
                 self._press(entry.press, time)
-        if self._keys and select.select([sys.stdin], [], [], 0.0)[0]:
-            for key in os.read(sys.stdin.fileno(), 64).decode(errors="ignore"):
-                self._key(key, time)
+        for key in self._keys.read() if self._keys else ():
+            self._key(key, time)
         if self.off:
             return bytes(40)
         return encode_remote(self._buttons if time < self._until else (), **self._sticks)
@@ -123,7 +114,7 @@ class Handset:
             self._sticks[stick] = max(-1.0, min(1.0, self._sticks[stick] + change))
         elif key in PRESSED:
             self._press(PRESSED[key], time)
-        elif key == " ":
+        elif key == "space":
             self._sticks |= dict.fromkeys(STICKS, 0.0)
         elif key == "h":
             self.hoist = not self.hoist
@@ -132,8 +123,5 @@ class Handset:
 
     def close(self) -> None:
         """Restore the terminal."""
-        if self._before is not None:
-            import termios
-
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
-            self._before = None
+        if self._keys:
+            self._keys.close()
