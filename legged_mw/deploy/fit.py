@@ -295,7 +295,8 @@ class Chain:
         name = contract.joints[sweep.joint]
         self.sweep, self.model = sweep, (model := _only_chain(spec, name))
         self._gains = np.array([contract.stiffness[sweep.joint], contract.damping[sweep.joint]])
-        self._all = [i for i, each in enumerate(contract.joints) if _has_joint(model, each)]  # index in the contract
+        joints = [model.joint(i).name for i in range(model.njnt)]
+        self._all = [i for i, each in enumerate(contract.joints) if each in joints]  # index in the contract
         self._dofs = np.array([model.joint(contract.joints[i]).dofadr[0] for i in self._all])
         self._angles = np.array([model.joint(contract.joints[i]).qposadr[0] for i in self._all])
         joint, self._actuator = model.joint(name), model.actuator(name).id
@@ -345,10 +346,6 @@ class Chain:
         model.actuator_gainprm[self._actuator, 0] = stiffness
         model.actuator_biasprm[self._actuator, 1:3] = -stiffness, -damping
         return model
-
-
-def _has_joint(model: mujoco.MjModel, name: str) -> bool:
-    return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0
 
 
 def _only_chain(spec: mujoco.MjSpec, joint: str) -> mujoco.MjModel:

@@ -42,7 +42,11 @@ def find_maker(file: Path, model: str, joints: Sequence[str]) -> Maker | None:
     The file's name is searched first, because some makers give the models of two robots the same name. If several names
     match, the longest is used. All patterns of the entry must match ``joints``.
     """
-    known = [maker for maker in read_makers() if all(_fits(pattern, joints) for pattern in maker.joints)]
+    known = [
+        maker
+        for maker in read_makers()
+        if all(any(fnmatchcase(joint, pattern) for joint in joints) for pattern in maker.joints)
+    ]
     for text in (file.stem, model):
         named = [maker for maker in known if _names(maker.name, text)]
         if named:
@@ -59,7 +63,3 @@ def read_makers() -> list[Maker]:
 def _names(name: str, text: str) -> bool:
     """Whether ``name`` is a whole part of ``text``: "h1" is one of "h1_2", but not of "h12"."""
     return bool(re.search(rf"(?<![a-z0-9]){re.escape(name)}(?![a-z0-9])", text.lower()))
-
-
-def _fits(pattern: str, joints: Sequence[str]) -> bool:
-    return any(fnmatchcase(joint, pattern) for joint in joints)

@@ -197,7 +197,8 @@ def write_archive(file: Path, text: str) -> None:
 
 def _text(file: Path) -> str:
     """The text of an MJCF, URDF or MJZ. Raises ValueError for a large file, or an MJZ with other contents."""
-    _check_size(file.name, file.stat().st_size)
+    if (size := file.stat().st_size) > MOST_BYTES:
+        raise ValueError(f"{file.name} has {size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
     if file.suffix != ARCHIVE:
         return _without_comments(file.read_text(encoding="utf-8", errors="replace"))
     held = io.BytesIO(file.read_bytes())
@@ -213,11 +214,6 @@ def _text(file: Path) -> str:
     raise ValueError(
         f"it holds {names}; that of an export holds only {_INSIDE}, deflated, of {MOST_BYTES >> 20} MiB at most"
     )
-
-
-def _check_size(name: str, size: int) -> None:
-    if size > MOST_BYTES:
-        raise ValueError(f"{name} has {size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
 
 
 def _without_comments(text: str) -> str:

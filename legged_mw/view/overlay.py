@@ -43,7 +43,8 @@ def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
         _draw_ghosts(scene, robots, moment.ghost)
     for fall in moment.falls:
         if fall.world < robots.count:
-            _draw_fall(scene, fall.place + robots.offsets[fall.world], robots.radius)
+            place, size = fall.place + robots.offsets[fall.world], (0.35 * robots.radius,) * 3
+            _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, size, place, FALL_RGBA, "fell")
 
 
 def draw_velocities(
@@ -127,11 +128,6 @@ def _draw_ghosts(scene: mujoco.MjvScene, robots: PosedRobots, qpos: FloatArray) 
     mujoco.mjv_addGeoms(robots.model, robots.ghost(qpos), option, mujoco.MjvPerturb(), moving, scene)
     for geom in scene.geoms[first : scene.ngeom]:
         geom.rgba[:], geom.matid, geom.category = GHOST_RGBA, -1, mujoco.mjtCatBit.mjCAT_DECOR
-
-
-def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:
-    """Append a ball with the word "fell" at the position of a fall."""
-    _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.35 * radius,) * 3, place, FALL_RGBA, "fell")
 
 
 def connect(
