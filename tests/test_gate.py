@@ -139,10 +139,16 @@ def test_a_run_named_by_its_task_is_graded_by_its_export(tmp_path: Path, monkeyp
     run = tmp_path / "logs" / "mine" / "first"
     shutil.copytree(GO2, run / "export")
     monkeypatch.chdir(tmp_path)
+    exported: list[tuple[str, int]] = []
+    scratch = tmp_path / "scratch"
     for name in ("mine/first", "logs/mine/first"):
-        found = gate.find_export(name)
-        assert found is not None and found.resolve() == run / "export"
-        assert gate.find_export(name, checkpoint=3) is None
+        found = gate.find_export(name, -1, lambda name, checkpoint, _: exported.append((name, checkpoint)), scratch)
+        assert found.resolve() == run / "export" and not exported
+        assert (
+            gate.find_export(name, 3, lambda name, checkpoint, _: exported.append((name, checkpoint)), scratch)
+            == scratch
+        )
+        assert exported.pop() == (name, 3)
 
 
 def test_deploy_yaml_acts_as_the_contract_does(tmp_path: Path) -> None:
