@@ -120,25 +120,23 @@ def test_joints_in_the_middle_are_their_own_partners(tmp_path: Path) -> None:
     }
 
 
-def test_a_joint_may_have_a_partner_within_a_tolerance(tmp_path: Path) -> None:
-    place = 'pos="0.1881 0.04675 0"'
-    for y in (0.0479, 0.0476):  # [m], beyond what is allowed and within it
-        apart = load_robot(tmp_path / "go1.xml", replaced(GO1, place, f'pos="0.1881 {y} 0"', 1))
-        if y > 0.04775:
-            with pytest.raises(ModelError):
-                find_partners(apart)
-    assert find_partners(apart).joints[:6] == (3, 4, 5, 0, 1, 2)
+PLACE, CALF = 'pos="0.1881 0.04675 0"', '<joint name="FL_calf_joint" class="calf"'
 
 
-def test_the_axis_of_a_partner_may_be_tilted_a_little(tmp_path: Path) -> None:
-    joint = '<joint name="FL_calf_joint" class="calf"'
-    for tilt in (0.02, 0.008):  # [rad], beyond what is allowed and within it
-        tilted = load_robot(tmp_path / "go1.xml", replaced(GO1, joint, f'{joint} axis="{tilt} 1 0"', 1))
-        if tilt > 0.01:
-            with pytest.raises(ModelError):
-                find_partners(tilted)
-    assert find_partners(tilted).joints[:6] == (3, 4, 5, 0, 1, 2)
-    assert find_partners(tilted).signs[:6] == (-1, 1, 1, -1, 1, 1)
+@pytest.mark.parametrize(
+    ("old", "too_far", "near"),
+    [
+        (PLACE, 'pos="0.1881 0.0479 0"', 'pos="0.1881 0.0476 0"'),  # [m]
+        (CALF, f'{CALF} axis="0.02 1 0"', f'{CALF} axis="0.008 1 0"'),  # [rad]
+    ],
+    ids=["place", "axis"],
+)
+def test_a_joint_may_have_a_partner_within_a_tolerance(tmp_path: Path, old: str, too_far: str, near: str) -> None:
+    apart, alike = (load_robot(tmp_path / "go1.xml", replaced(GO1, old, new, 1)) for new in (too_far, near))
+    with pytest.raises(ModelError):
+        find_partners(apart)
+    assert find_partners(alike).joints[:6] == (3, 4, 5, 0, 1, 2)
+    assert find_partners(alike).signs[:6] == (-1, 1, 1, -1, 1, 1)
 
 
 # ---- observations and actions

@@ -19,7 +19,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, compile_scene, part
 from legged_mw.deploy.robot import Floats
-from legged_mw.robot.mjcf import XmlSource, check_model
+from legged_mw.robot.mjcf import XmlSource, add_rotors, check_model
 from legged_mw.utils.errors import UserError, unknown
 from legged_mw.view.posed_robot import lowest_point
 
@@ -91,11 +91,9 @@ def _in_scene(
 
 
 def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
-    """Remove the file's actuators and keyframes. Returns joint -> largest torque [N m], where an actuator states it.
-
-    The inertia of an actuator's rotor, reflected by its gear, becomes its joint's armature.
-    """
+    """Remove the file's actuators and keyframes. Returns joint -> largest torque [N m], where an actuator states it."""
     limits: dict[str, float] = {}
+    add_rotors(spec)
     for actuator in list(spec.actuators):
         gear = abs(float(actuator.gear[0]))
         force, control = actuator.forcerange, actuator.ctrlrange
@@ -103,8 +101,6 @@ def _drop_motors(spec: mujoco.MjSpec) -> dict[str, float]:
             limits[actuator.target] = gear * float(np.abs(force).max())
         elif actuator.biastype == mujoco.mjtBias.mjBIAS_NONE and control[1] > control[0]:
             limits[actuator.target] = gear * abs(float(actuator.gainprm[0])) * float(np.abs(control).max())
-        if actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and (joint := spec.joint(actuator.target)):
-            joint.armature += actuator.armature * gear**2
         spec.delete(actuator)
     for key in list(spec.keys):  # a keyframe has a control for each actuator
         spec.delete(key)

@@ -154,17 +154,16 @@ class Actuators:
 
     def apply(self, actions: Tensor) -> None:
         """Compute the motor commands of ``actions`` (N, D)."""
-        # a target from measured angles is delayed as a whole: the angles are those that the policy acted on
-        late_target = self._delay if self._origin == "joints" else None
-        actions = self._delay(actions) if self._delay and not late_target else actions
+        if self._delay and self._origin != "joints":
+            actions = self._delay(actions)
         if self.law == OWN:
             self._sent.copy_(actions)
         elif self.law == "torque" or self._origin == "speed":
             torch.mul(actions, self.scale, out=self.targets)
         else:
             torch.addcmul(self._origin_angles(), actions, self.scale, out=self.targets)
-            if late_target:
-                self.targets.copy_(late_target(self.targets))
+            if self._delay and self._origin == "joints":  # late as a whole: the policy acted on the angles of then
+                self.targets.copy_(self._delay(self.targets))
             if self._offset is not None:
                 torch.sub(self.targets, self._offset, out=self._sent)
         if self._late:

@@ -22,7 +22,10 @@ from xml.parsers import expat
 import mujoco
 import numpy as np
 
+from legged_mw.sim.robot_file import SCALAR_JOINTS
+
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
+ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)  # transmissions of actuators
 _INSIDE = "model.xml"
 MOST_BYTES = 64 << 20  # of one file: ten times the largest known robots with inline meshes
 # Largest mass of a body [kg]; length [m] or inertia [kg m^2]; gravity [m/s^2], which is 981 for a file in cm.
@@ -257,6 +260,17 @@ def _wrong(name: str, value: str) -> str:
     ):
         return f"must be from 0 to {_MOST[name]:g}"
     return ""
+
+
+def add_rotors(spec: mujoco.MjSpec) -> list[str]:
+    """Add the inertias of the actuators' rotors, reflected by their gears, to their joints' armatures. Returns notes."""
+    notes = []
+    for actuator in spec.actuators:
+        joint = spec.joint(actuator.target) if actuator.trntype in ON_JOINTS else None
+        if joint is not None and joint.type in SCALAR_JOINTS and actuator.armature:
+            old, joint.armature = joint.armature, joint.armature + actuator.armature * actuator.gear[0] ** 2
+            notes.append(f"{joint.name} armature: {old:g} -> {joint.armature:g} kg m^2, with its actuator's")
+    return notes
 
 
 def check_model(model: Any) -> None:

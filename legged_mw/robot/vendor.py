@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.robot.meshes import compile_readable
-from legged_mw.robot.mjcf import XmlSource, check_model
+from legged_mw.robot.mjcf import ON_JOINTS, XmlSource, add_rotors, check_model
 from legged_mw.robot.urdf import read_urdf
 from legged_mw.sim.robot_file import (
     SCALAR_JOINTS,
@@ -34,7 +34,6 @@ from legged_mw.utils.errors import ModelError
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # number of columns in qpos; other joints have one
-_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 _ROUNDING = 1e-9  # share of the largest moment of inertia
 _THIN = 1e-3  # smallest (thickness / length)^2 of a body with corrected inertia, about [ours]
@@ -61,7 +60,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         source = XmlSource(file)
         spec, speeds = read_urdf(source, notes, lost) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
-        _take_armatures(spec, notes)
+        notes += add_rotors(spec)
         limits = _take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
         sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
@@ -93,15 +92,6 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
                 setattr(body, name, getattr(fresh, name))
 
 
-def _take_armatures(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Add the inertias of the actuators' rotors, reflected by their gears, to the armatures of their joints."""
-    for actuator in spec.actuators:
-        joint = spec.joint(actuator.target) if actuator.trntype in _JOINTS else None
-        if joint is not None and joint.type in SCALAR_JOINTS and actuator.armature:
-            old, joint.armature = joint.armature, joint.armature + actuator.armature * actuator.gear[0] ** 2
-            notes.append(f"{joint.name} armature: {old:g} -> {joint.armature:g} kg m^2, with its actuator's")
-
-
 def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     """Remove the file's actuators. Return joint -> lowest and highest force at the joint [N m].
 
@@ -112,7 +102,7 @@ def _take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     if actuators := list(spec.actuators):
         notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced")
     for actuator in actuators:
-        if actuator.trntype in _JOINTS and actuator.target not in limits:
+        if actuator.trntype in ON_JOINTS and actuator.target not in limits:
             force = _force(actuator)
             if force is not None:
                 limits[actuator.target] = (float(min(force)), float(max(force)))
