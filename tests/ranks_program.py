@@ -86,7 +86,7 @@ def update() -> dict[str, Any]:
         torch.distributed.init_process_group("nccl" if on_gpus else "gloo", rank=rank.index, world_size=rank.count)
     ranks = {"global_rank": rank.index, "local_rank": rank.local, "world_size": rank.count}
     stock, ours = (make(kind, device, multi_gpu=ranks) for kind in (PPO, GraphedPPO))
-    assert ours.graphed and ours.is_multi_gpu
+    assert isinstance(ours, GraphedPPO) and ours.is_multi_gpu
     found = []
     for number in range(6 if on_gpus else 2):  # on GPUs the last three are replayed
         collect(stock, device, seed=100 * rank.index + number)

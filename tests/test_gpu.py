@@ -290,7 +290,7 @@ def test_an_older_graph_that_nobody_needs_does_not_end_a_recording() -> None:
 def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
     """Each of six updates of 20 minibatches, the last three replayed, from equal states and the stock learner's experience."""
     stock, ours = make(PPO, DEVICE, **settings), make(GraphedPPO, DEVICE, **settings)
-    assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
+    assert isinstance(ours, GraphedPPO) and difference(parameters(stock), parameters(ours)) == 0.0
     for _ in six_equal_updates(stock, ours):
         assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
 

@@ -74,7 +74,7 @@ def test_same_parameters_as_rsl_rl(
 ) -> None:
     """In float64: two updates, each from new experience of the stock learner, whose memory goes on from one to the next."""
     stock, ours = make(PPO, memory=memory, **settings), make(GraphedPPO, memory=memory, **settings)
-    assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
+    assert isinstance(ours, GraphedPPO) and difference(parameters(stock), parameters(ours)) == 0.0
     before = parameters(ours)
     for seed in range(2):
         collect(stock, seed=seed)

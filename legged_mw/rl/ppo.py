@@ -22,6 +22,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
+from rsl_rl.utils import resolve_optimizer
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -50,9 +51,8 @@ _MIN_RATE, _RATE_STEP = 1e-5, 1.5  # adaptive learning rate: lowest value, facto
 
 
 class Recorded:
-    """First base class of a recorded learner. The second is rsl-rl's algorithm, which runs alone if not ``graphed``."""
+    """First base class of a recorded learner. The second is rsl-rl's algorithm."""
 
-    graphed: bool
     learning_rate: float
     optimizer: Any
     device: str
@@ -65,44 +65,44 @@ class Recorded:
 
     def release(self) -> None:
         """Delete the recorded graphs: NCCL does not close a connection that a CUDA graph still uses."""
-        if self.graphed:
-            self._begin()
+        self._begin()
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
         """Store the transition, and clear the hidden states of worlds whose episode ended."""
         super().process_env_step(obs, rewards, dones, extras)  # type: ignore[misc]
-        if self.graphed:
-            self._memories.forget(dones)
+        self._memories.forget(dones)
 
     def save(self) -> dict[str, Any]:
         """State of the networks and the optimizer, in rsl-rl's form."""
         content = super().save()  # type: ignore[misc]
-        if self.graphed:
-            rates = [self.learning_rate, *map(float, self._rates[1:])]
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
+        rates = [self.learning_rate, *map(float, self._rates[1:])]
+        content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load a checkpoint of this class or of rsl-rl. Distillation also loads its teacher from a PPO checkpoint."""
         iteration = super().load(loaded_dict, load_cfg, strict)  # type: ignore[misc]
-        if self.graphed:
-            make_recordable(self.optimizer, self._rates, str(self.device))
-            self._begin()  # Adam's state has new addresses
+        make_recordable(self.optimizer, self._rates, str(self.device))
+        self._begin()  # Adam's state has new addresses
         return iteration
 
 
-def why_stock(learner: Any, policy: MLPModel, other: MLPModel, regressing: MLPModel) -> str | None:
-    """Why a learner with two networks cannot be recorded, or None. Only ``regressing`` may be a RegressingModel."""
+def why_stock(policy: MLPModel, other: MLPModel, regressing: MLPModel, settings: Mapping[str, Any]) -> str | None:
+    """Why a learner with two networks cannot be recorded, or None. Only ``regressing`` may be a RegressingModel.
+
+    ``settings``: the arguments of rsl-rl's algorithm.
+    """
     for network in (policy, other):
         known = type(network) is MLPModel or isinstance(network, RememberingModel)
         if not known and not (network is regressing and isinstance(network, RegressingModel)):
             return f"a network is a {type(network).__name__}"
-    if learner.use_mixed_precision:
+    if settings.get("use_mixed_precision"):
         return "use_mixed_precision is set"
     if getattr(type(policy.distribution), "sample", None) is not GaussianDistribution.sample:
         return f"actions are drawn from a {type(policy.distribution).__name__}"
-    if type(learner.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
-        return f"the optimizer is {type(learner.optimizer).__name__}"
+    optimizer: Any = resolve_optimizer(settings.get("optimizer", "adam"))
+    if optimizer not in (torch.optim.Adam, torch.optim.AdamW):
+        return f"the optimizer is {optimizer.__name__}"
     return None
 
 
@@ -119,35 +119,41 @@ class GraphedPPO(Recorded, PPO):
     """PPO whose acting and update are replayed CUDA graphs.
 
     A minibatch holds random samples, or whole worlds if a network is recurrent (RNNModel). The first three updates run
-    without a graph and the fourth is recorded, so no update is lost to warm-up. In these cases rsl-rl's own update runs
-    and a message says so: a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed precision,
-    an optimizer other than Adam or AdamW, a distribution that is not Gaussian.
+    without a graph and the fourth is recorded, so no update is lost to warm-up. In these cases it is rsl-rl's own PPO
+    instead, and a message says so: a network other than a plain MLPModel or RNNModel, shared parameters, RND, mixed
+    precision, an optimizer other than Adam or AdamW, a distribution that is not Gaussian.
     """
 
     critic_only = False  # True during the critic's warm-up: the actor does not learn
     half = False  # see ``learn_in_half``
     _bound: float | None  # upper bound of the adaptive learning rate, or None
-    _plain_rate: float  # the learning rate, if not graphed
-    _rate: Tensor | None = None  # the learning rate () if graphed; float64 like rsl-rl's Python number
+    rate: Tensor  # the learning rate (), float64 like rsl-rl's Python number; reading it does not wait for the device
+
+    def __new__(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> Any:
+        """Make a recorded learner, or rsl-rl's own if this configuration cannot be recorded."""
+        reason = why_stock(actor, critic, actor, settings)
+        if settings.get("rnd_cfg"):
+            reason = "rnd_cfg is set"
+        elif not {*map(id, actor.parameters())}.isdisjoint(map(id, critic.parameters())):
+            reason = "the networks share parameters"
+        if not reason:
+            return super().__new__(cls)
+        if settings.pop("max_learning_rate", None):
+            raise ConfigError(f"algorithm.max_learning_rate needs the recorded update, and rsl-rl's own runs: {reason}")
+        print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
+        return PPO(actor, critic, storage, **settings)
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
         self._recurrent = actor.is_recurrent or critic.is_recurrent
         symmetry, self._bound = settings.pop("symmetry_cfg", None), settings.pop("max_learning_rate", None)
+        # first, because rsl-rl's PPO sets the learning rate
+        self.rate, self._adam_rate = (
+            torch.zeros((), dtype=dtype, device=settings["device"]) for dtype in (torch.float64, torch.float32)
+        )
         super().__init__(actor, critic, storage, symmetry_cfg=None if self._recurrent else symmetry, **settings)
-        reason = self._why_stock()
-        self.graphed = reason is None
         if self._recurrent:
-            _check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
+            _check_recurrent(storage.num_envs, self.num_mini_batches, symmetry)
             self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl rejects it for recurrent networks
-        if reason:
-            if self._bound:
-                raise ConfigError(
-                    f"algorithm.max_learning_rate needs the recorded update, and rsl-rl's own runs: {reason}"
-                )
-            print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
-            return
-        self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
-        self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
         self._parts, own_rates = trained_parts(self.actor, self.critic)
         self._rates = [self._adam_rate, *own_rates]
         learners = [self._parts[0] + self._parts[1], *self._parts[2:]]
@@ -159,14 +165,6 @@ class GraphedPPO(Recorded, PPO):
         self._adams = [FlatAdam(self.optimizer, max(0, i - 1), part, self.max_grad_norm) for i, part in flat]
         self.rollback = UpdateRollback(self, (self.actor, self.critic))
         self._begin()
-
-    def _why_stock(self) -> str | None:
-        """Why this configuration cannot be recorded, or None."""
-        if self.rnd:
-            return "rnd_cfg is set"
-        if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
-            return "the networks share parameters"
-        return why_stock(self, self.actor, self.critic, regressing=self.actor)
 
     def _begin(self) -> None:
         st, device = self.storage, self.device
@@ -232,8 +230,6 @@ class GraphedPPO(Recorded, PPO):
 
     def act(self, obs: TensorDict) -> Tensor:
         """Sample actions (N, A). ``transition`` holds values and distribution until ``process_env_step``."""
-        if not self.graphed:
-            return super().act(obs)
         if self.storage.step == 0:
             self._memories.begin_rollout()
         self._obs.copy_(obs)
@@ -267,12 +263,9 @@ class GraphedPPO(Recorded, PPO):
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Write returns and advantages of the stored transitions into the storage."""
-        if not self.graphed:
-            super().compute_returns(obs)
-        else:
-            self._obs.copy_(obs)
-            self._returns_graph()
-            self.storage.advantages = self._advantages
+        self._obs.copy_(obs)
+        self._returns_graph()
+        self.storage.advantages = self._advantages
 
     def _compute_returns(self) -> None:
         memory = self._memories.get(self.critic)
@@ -286,8 +279,6 @@ class GraphedPPO(Recorded, PPO):
 
     def update(self) -> dict[str, Any]:
         """Run one update on the storage. Returns the mean losses as tensors ()."""
-        if not self.graphed:
-            return super().update()
         torch.randperm(len(self._order), out=self._order)  # one permutation for all epochs, as in rsl-rl
         self._entropy_coef.fill_(self.entropy_coef)  # these two may change between updates
         self._desired_kl.fill_(self.desired_kl or 0.0)
@@ -422,18 +413,17 @@ class GraphedPPO(Recorded, PPO):
 
     def _adapt_rate(self, kl: Tensor) -> None:
         """rsl-rl's rule: lower the rate if KL > 2 ``desired_kl``, raise it if KL < ``desired_kl`` / 2."""
-        assert self._rate is not None
         highest = self._bound or MAX_RATE
         if kernels := kernels_for(kl):
             kernels.launch(
-                kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, highest
+                kernels.adapt_rate, 1, kl, self._desired_kl, self.rate, self._adam_rate, _RATE_STEP, _MIN_RATE, highest
             )
             return
-        slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
-        faster = (self._rate * _RATE_STEP).clamp(max=highest)
-        rate = torch.where((kl < self._desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
-        self._rate.copy_(torch.where(kl > self._desired_kl * 2.0, slower, rate))
-        self._adam_rate.copy_(self._rate)
+        slower = (self.rate / _RATE_STEP).clamp(min=_MIN_RATE)
+        faster = (self.rate * _RATE_STEP).clamp(max=highest)
+        rate = torch.where((kl < self._desired_kl / 2.0) & (kl > 0.0), faster, self.rate)
+        self.rate.copy_(torch.where(kl > self._desired_kl * 2.0, slower, rate))
+        self._adam_rate.copy_(self.rate)
 
     def _update_normalizers(self) -> None:
         obs = self.storage.observations.flatten(0, 1)
@@ -465,32 +455,24 @@ class GraphedPPO(Recorded, PPO):
         return iteration
 
     @property
-    def rate(self) -> Tensor:
-        """The learning rate () as a tensor. Reading it does not wait for the device."""
-        return torch.tensor(self._plain_rate) if self._rate is None else self._rate
-
-    @property
     def learning_rate(self) -> float:  # type: ignore[override]
         """The current learning rate. Reading it waits for the device, setting it does not."""
-        return self._plain_rate if self._rate is None else float(self._rate)
+        return float(self.rate)
 
     @learning_rate.setter
     def learning_rate(self, rate: float) -> None:
-        if self._rate is None:
-            self._plain_rate = float(rate)
-        else:
-            self._rate.fill_(float(rate))
-            self._adam_rate.fill_(float(rate))
+        self.rate.fill_(float(rate))
+        self._adam_rate.fill_(float(rate))
 
 
-def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
+def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None) -> None:
     """Raise ConfigError for settings that do not work with a recurrent network."""
     if worlds < minibatches:
         raise ConfigError(
             f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, "
             f"and env.num_envs is {worlds}: raise the latter or lower the former"
         )
-    if symmetry and not (recorded and symmetry["use_data_augmentation"]):
+    if symmetry and not symmetry["use_data_augmentation"]:
         raise ConfigError(
             "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both "
             "this project's recorded update; switch the former on, or both off"
@@ -523,7 +505,7 @@ class UpdateRollback:
         for i, memory in enumerate(optimizer.state.values()):
             values |= {f"memory {i}.{name}": value for name, value in memory.items()}
         values |= {f"rate {i}": group["lr"] for i, group in enumerate(optimizer.param_groups)}
-        values["rate"] = getattr(self._learner, "_rate", None)
+        values["rate"] = getattr(self._learner, "rate", None)
         return {name: value for name, value in values.items() if isinstance(value, Tensor) and value.numel()}
 
     @torch.no_grad()

@@ -45,7 +45,7 @@ from legged_mw.rl.iteration_log import (
 from legged_mw.rl.learner_config import RobotTaskCfgPPO, rsl_rl_config
 from legged_mw.rl.networks import RegressingModel
 from legged_mw.rl.policies import TEACHER, acting, adapt
-from legged_mw.rl.ppo import GraphedPPO, UpdateRollback
+from legged_mw.rl.ppo import GraphedPPO, Recorded, UpdateRollback
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
 from legged_mw.rl.run_folder import (
     CheckpointWriter,
@@ -84,10 +84,9 @@ class Runner(OnPolicyRunner):
         self.why_not_exact = "it is a new run"  # why `load` did not restore the worlds of a checkpoint
         self.writer: CheckpointWriter | None = None  # made in `learn` if the run has a folder
         self._divergence = DivergenceStop()
-        recorded = getattr(self.alg, "graphed", False)
+        self._rolls_back = not isinstance(self.alg, Recorded)  # the recorded update rolls itself back
         learner: Any = self.alg
-        self._rollback = learner.rollback if recorded else UpdateRollback(learner, self._networks().values())
-        self._rolls_back = not recorded  # the recorded update rolls itself back
+        self._rollback = UpdateRollback(learner, self._networks().values()) if self._rolls_back else learner.rollback
         self._finite_check = FiniteCheck([name for each in env.nonfinite for name in each.names], self._stored_names())
         # policy -> figures for the log; called every `exam_interval` iterations and after the last one
         self.examine: Callable[[Any], dict[str, float]] | None = None
@@ -509,14 +508,14 @@ def make_runner(
         runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
-    graphed = isinstance(runner.alg, GraphedPPO) and runner.alg.graphed
+    recorded = isinstance(runner.alg, GraphedPPO)
     if half and isinstance(runner.alg, GraphedPPO):
         runner.alg.learn_in_half()
-    if settings["critic_warmup"] and not graphed:
+    if settings["critic_warmup"] and not recorded:
         raise ConfigError(
             f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0"
         )
-    if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:
+    if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not recorded:
         who = "a student learns nothing but to act like its teacher" if teacher else "rsl-rl's own is used here"
         raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and {who}: set it to []")
     return runner

@@ -24,18 +24,25 @@ from legged_mw.sim.graph import StepGraph
 class GraphedDistillation(Recorded, Distillation):
     """Distillation with acting and update as replayed CUDA graphs.
 
-    In these cases rsl-rl's own code runs and a message says so: a network other than a plain MLPModel or RNNModel,
-    mixed precision, an optimizer other than Adam or AdamW, a distribution that is not Gaussian. On a CPU nothing is
-    recorded.
+    In these cases it is rsl-rl's own Distillation instead, and a message says so: a network other than a plain MLPModel
+    or RNNModel, mixed precision, an optimizer other than Adam or AdamW, a distribution that is not Gaussian. On a CPU
+    nothing is recorded.
     """
+
+    def __new__(cls, student: MLPModel, teacher: MLPModel, storage: RolloutStorage, **settings: Any) -> Any:
+        """Make a recorded learner, or rsl-rl's own if this configuration cannot be recorded."""
+        # a teacher may have an estimator, because it does not learn
+        reason = why_stock(student, teacher, teacher, settings)
+        steps, length = storage.num_transitions_per_env, settings["gradient_length"]
+        if steps % length:
+            reason = f"gradient_length {length} does not divide a rollout of {steps} steps"
+        if not reason:
+            return super().__new__(cls)
+        print(f"Distillation: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
+        return Distillation(student, teacher, storage, **settings)
 
     def __init__(self, student: MLPModel, teacher: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
         super().__init__(student, teacher, storage, **settings)
-        reason = self._why_stock()
-        self.graphed = reason is None
-        if reason:
-            print(f"Distillation: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
-            return
         self._rates = [self.learning_rate]
         make_recordable(self.optimizer, self._rates, str(self.device))
         seen = storage.observations.select(*student.obs_groups, *teacher.obs_groups)
@@ -48,14 +55,6 @@ class GraphedDistillation(Recorded, Distillation):
         self.rollback = UpdateRollback(self, (self.student,))
         self._begin()
 
-    def _why_stock(self) -> str | None:
-        """Why this configuration cannot be recorded, or None."""
-        if self.storage.num_transitions_per_env % self.gradient_length:
-            steps = self.storage.num_transitions_per_env
-            return f"gradient_length {self.gradient_length} does not divide a rollout of {steps} steps"
-        # a teacher may have an estimator, because it does not learn
-        return why_stock(self, self.student, self.teacher, regressing=self.teacher)
-
     def _begin(self) -> None:
         """Make empty memories, and graphs that the next calls record."""
         self._memories = Memories((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
@@ -65,8 +64,6 @@ class GraphedDistillation(Recorded, Distillation):
 
     def act(self, obs: TensorDict) -> Tensor:
         """The student's sampled actions (N, A). The transition holds the teacher's until ``process_env_step``."""
-        if not self.graphed:
-            return super().act(obs)
         if self.storage.step == 0:
             self._memories.begin_rollout()
         self._obs.copy_(obs.select(*self._obs.keys()))
@@ -92,8 +89,6 @@ class GraphedDistillation(Recorded, Distillation):
 
     def update(self) -> dict[str, Any]:
         """Learn from the storage step by step. Returns the mean loss as a tensor ()."""
-        if not self.graphed:
-            return super().update()
         self.num_updates += 1
         self._update_graph()
         self.storage.clear()
