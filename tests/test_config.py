@@ -17,6 +17,7 @@ import yaml
 from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.rl.learner_config import check_classes, fit_cpu
 from legged_mw.rl.run_folder import update_from_run
 from legged_mw.rl.students.distillation import GraphedDistillation
@@ -670,6 +671,16 @@ def test_a_run_older_than_a_section_keeps_what_was_so_then() -> None:
     assert update_from_run(task, saved, where="config.yaml") == ["anneal", "symmetry"]
     assert not task.train.symmetry.use_data_augmentation and task.train.anneal.desired_kl == 0.0
     assert update_from_run(load_task("go1_flat"), load_task("go1_flat").to_dict(), where="config.yaml") == []
+
+
+@pytest.mark.parametrize(("name", "section"), [("go1_rough", "gait"), ("go2_rough", "observations")])
+def test_a_run_older_than_what_its_policy_could_read_reads_it_not(name: str, section: str) -> None:
+    """A clock or frames that the task got since would change the size of the network's input."""
+    task, saved = load_task(name), load_task(name).to_dict()
+    del saved[section]
+    task.set("rewards.scales.contact_phase", 0.0)
+    update_from_run(task, saved, where="config.yaml")
+    assert task.to_dict()[section] == LeggedRobotCfg().to_dict()[section] != load_task(name).to_dict()[section]
 
 
 # ---- names of former releases

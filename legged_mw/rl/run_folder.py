@@ -320,7 +320,8 @@ def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> l
 
     If the file lacks a learner's section, the run is older than the section. The section then gets the values of the
     base class, as the run had them, not those of the task. Returns the names of these sections.
-    A reward that the file lacks is newer than the run, too, and stays off.
+    A reward that the file lacks is newer than the run, too, and stays off; a field of ``gait`` or ``observations`` gets
+    the value of the base class, because the policy reads what these say.
     """
     saved = _with_new_names(saved)
     run_task = str(saved.get("task", task.name))
@@ -335,8 +336,17 @@ def update_from_run(task: LoadedTask, saved: Mapping[str, Any], where: str) -> l
     newer = {name: value for name, value in defaults.items() if name not in saved and isinstance(value, dict)}
     if isinstance(rewards := saved.get("rewards"), dict) and isinstance(scales := rewards.get("scales"), dict):
         rewards["scales"] = dict.fromkeys(task.to_dict()["rewards"]["scales"], 0.0) | scales
+    for name in ("gait", "observations"):
+        if (base := _of_base(task, name)) and isinstance(given := saved.get(name, {}), dict):
+            saved[name] = {**base, **given}
     task.update({**saved, **newer}, where)
     return list(newer)
+
+
+def _of_base(task: LoadedTask, section: str) -> dict[str, Any]:
+    """A section of the task's config as the class that declares it has it; empty if there is none."""
+    kinds = [kind for kind in type(task.cfg).__mro__ if issubclass(kind, Config) and hasattr(kind, section)]
+    return kinds[-1]().to_dict()[section] if kinds else {}
 
 
 def _with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
