@@ -1,7 +1,7 @@
 """The learning curve of a run as curve.csv and curve.webp: python benchmarks/curve.py logs/go2_flat/<time> resources/policies/go2_flat
 
 Seconds are of training: from the end of its first iteration, which records the step and compiles kernels that are not cached. Pauses are
-left out: where a run was resumed, or an iteration took over 5 s for another reason.
+left out: where a run was resumed, or an iteration took over 5 s, and three times as long as half of them, for another reason.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import csv
 import io
 from itertools import accumulate, pairwise
 from pathlib import Path
+from statistics import median
 
 import matplotlib
 from PIL import Image
@@ -24,6 +25,8 @@ COLUMNS = {
     "steps": "Train/total_steps",
     "reward": "Train/mean_reward",
     "action_std": "Policy/mean_std",
+    "terrain_level": "Curriculum/terrain_level",
+    "stairs_up": "Curriculum/terrain_level/stairs_up",
     "error_vx": "Exam/error_vx",
     "error_vy": "Exam/error_vy",
     "error_yaw": "Exam/error_yaw",
@@ -44,7 +47,8 @@ def read(run: Path) -> dict[str, dict[int, float]]:
     }
     rewards = events.Scalars(COLUMNS["reward"])
     took = [0.0, *(after.wall_time - before.wall_time for before, after in pairwise(rewards))]
-    seconds = accumulate(spent if spent < PAUSE else 0.0 for spent in took)
+    pause = max(PAUSE, 3.0 * median(took))
+    seconds = accumulate(spent if spent < pause else 0.0 for spent in took)
     return {"seconds": dict(zip((event.step for event in rewards), seconds, strict=True)), **curve}
 
 
@@ -60,15 +64,26 @@ def write_csv(curve: dict[str, dict[int, float]], path: Path, every: int) -> Non
 
 
 def draw(curve: dict[str, dict[int, float]], path: Path) -> None:
-    """Reward, and where exams were taken their errors, against seconds of training; 256 colours, for a small file."""
-    panels = 1 + ("error_vx" in curve)
+    """Reward, and levels of rough ground and the exams' errors where there are some, against seconds of training.
+
+    256 colours, for a small file.
+    """
+    levels, exams = "terrain_level" in curve, "error_vx" in curve
+    panels = 1 + levels + exams
     figure, axes = plt.subplots(1, panels, figsize=(4.5 * panels, 3.2), layout="constrained", squeeze=False)
-    left, right = axes[0, 0], axes[0, -1]
+    left, middle, right = axes[0, 0], axes[0, 1 if levels else 0], axes[0, -1]
     seconds = curve["seconds"]
     left.plot([*seconds.values()], [curve["reward"][step] for step in seconds], lw=1)
     left.set(xlabel="seconds of training", ylabel="return of an episode")
     left.grid(alpha=0.3)
-    if right is not left:
+    if levels:
+        for column, label in (("terrain_level", "all kinds"), ("stairs_up", "stairs up")):
+            values = curve.get(column, {})
+            middle.plot([seconds[step] for step in values], [*values.values()], lw=1, label=label)
+        middle.set(xlabel="seconds of training", ylabel="mean level of the ground")
+        middle.legend(frameon=False)
+        middle.grid(alpha=0.3)
+    if exams:
         for column, unit in (("error_vx", "m/s"), ("error_vy", "m/s"), ("error_yaw", "rad/s")):
             values = curve[column]
             right.plot(
