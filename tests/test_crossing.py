@@ -23,7 +23,7 @@ from legged_mw.eval.rough import TILES
 from legged_mw.eval.walking import LEVELS
 from legged_mw.utils.task import LoadedTask, load_task
 
-COMMANDS = slice(45, 48)  # of the group "state"
+COMMANDS = slice(53, 56)  # of the group "state"
 
 
 def rough_task(kinds: dict[str, float]) -> LoadedTask:
@@ -98,7 +98,7 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
 
 def test_the_same_whatever_the_seed_and_nothing_drawn_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rough, "SECONDS", 0.3)
-    mix = torch.randn(48, 12, generator=torch.Generator().manual_seed(0))
+    mix = torch.randn(56, 12, generator=torch.Generator().manual_seed(0))
     ends = []
     for seed in (1, 2):
         torch.manual_seed(seed)

@@ -13,6 +13,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
+from test_export import untrained
 
 from legged_mw import ROOT
 from legged_mw.deploy import gate
@@ -21,11 +22,11 @@ from legged_mw.deploy.controller import Controller
 from legged_mw.deploy.stage import SCATTER, DeployStage
 from legged_mw.eval import walking
 from legged_mw.eval.walking import Figure
+from legged_mw.export.exporter import export
 from legged_mw.unitree import deploy_yaml
 from legged_mw.utils.errors import UserError
 
 GO2 = ROOT / "resources/policies/go2_flat"
-ROUGH = ROOT / "resources/policies/go2_rough"  # without a clock, which that program does not know
 Program = Callable[..., int]
 
 
@@ -153,10 +154,13 @@ def test_a_run_named_by_its_task_is_graded_by_its_export(tmp_path: Path, monkeyp
 
 def test_deploy_yaml_acts_as_the_contract_does(tmp_path: Path) -> None:
     """The file is read as unitree_rl_lab's C++ does it: terms in order, scaled, gains by motor, offset plus scale."""
-    contract = read_contract(ROUGH)
-    deploy_yaml.write(ROUGH, contract, tmp_path)
+    no_clock = {"gait.period": 0.0, "gait.offsets": [], "rewards.scales.contact_phase": 0.0}
+    settings = no_clock | {"observations.history": {}}
+    export(*untrained(ROOT / "configs/go2_flat.py", tmp_path, settings), folder := tmp_path / "export")
+    contract = read_contract(folder)
+    deploy_yaml.write(folder, contract, tmp_path)
     said = yaml.safe_load((tmp_path / "params/deploy.yaml").read_text())
-    stage, controller = DeployStage(ROUGH, 1), Controller(ROUGH, contract, 1)
+    stage, controller = DeployStage(folder, 1), Controller(folder, contract, 1)
     stage.scatter(1)
     measured, command = stage.measured, np.array([[0.5, -0.2, 0.3]])
     targets = controller.act(measured, command)[0]

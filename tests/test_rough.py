@@ -89,7 +89,7 @@ def test_the_scan_is_noisy_for_the_policy_and_true_for_the_critic() -> None:
     error = (seen - true).abs()
     assert 0.08 < error.max() <= 0.1 + 1e-6 and torch.equal(true, env.height_scan)
     blind = rough(8)
-    assert blind.obs_buf["state"].shape[1] == 48 and blind.obs_buf["privileged_state"].shape[1] == 123 + 187
+    assert blind.obs_buf["state"].shape[1] == 56 and blind.obs_buf["privileged_state"].shape[1] == 131 + 187
 
 
 def test_the_scan_of_the_policy_is_late_also_in_a_table_of_its_own() -> None:

@@ -109,7 +109,7 @@ def test_a_students_run(student: Path, teacher: Path) -> None:
     assert sorted(path.name for path in (student / TEACHER).iterdir()) == ["config.yaml", "model_2.pt"]
     assert load_yaml(student / TEACHER / "config.yaml") == load_yaml(teacher / "config.yaml")
     first, last = load(student / "model_2.pt")["student_state_dict"], content["student_state_dict"]
-    assert last["mlp.0.weight"].shape == (24, 450) and not torch.equal(last["mlp.0.weight"], first["mlp.0.weight"])
+    assert last["mlp.0.weight"].shape == (24, 530) and not torch.equal(last["mlp.0.weight"], first["mlp.0.weight"])
     assert last["distribution.std_param"].unique().tolist() == [pytest.approx(0.1)]
     assert last["obs_normalizer.count"] == 3 * 8 * 16
 
@@ -119,7 +119,10 @@ def test_a_student_is_exported_and_deployed(
 ) -> None:
     contract = read_contract(student / "export")
     assert [(row.name, row.history) for row in contract.rows] == [
-        (name, 10) for name in ("base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "commands")
+        (name, 10)
+        for name in (
+            *("base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "gait_clock", "commands"),
+        )
     ]
     weights = {
         each.name: numpy_helper.to_array(each)
@@ -465,7 +468,8 @@ def test_a_policy_that_would_mean_something_else_is_refused(change: Any, value: 
 def test_a_network_of_other_rows_is_refused(student: Path, teacher: Path) -> None:
     """A run's config may be changed by hand, or its task's class: the sizes tell."""
     env, found = make_env(2), find_trained(str(teacher), student.parent, "--teacher")
-    found.task.set("terrain.height_scan", [])
+    for path, value in {"terrain.height_scan": [], "gait.period": 0.0, "gait.offsets": []}.items():
+        found.task.set(path, value)
     attach_teacher_observations(env, found)
     task = load_task("go1_flat")
     runner = make_runner(env, task.train, None, "cpu", found.task.train)

@@ -48,6 +48,7 @@ def hilly_spec() -> mujoco.MjSpec:
     for path, value in {
         "env.num_envs": 1,
         "terrain.num_rows": 2,
+        "terrain.difficulty": [0.0, 1.0],
         "terrain.num_cols": len(KINDS),
         "terrain.terrain_proportions": dict.fromkeys(KINDS, 1.0),
         "terrain.horizontal_scale": 0.1,
@@ -249,7 +250,7 @@ def test_play_has_a_small_grid_with_a_robot_on_each_kind() -> None:
     out, session = played()
     for line in (
         "env.num_envs: 8192 -> 8",
-        "terrain.num_rows: 10 -> 3",
+        "terrain.num_rows: 12 -> 3",
         "terrain.num_cols: 20 -> 8",
         "terrain.border_size: 5.0 -> 2.0",
     ):

@@ -56,20 +56,20 @@ class Tripped(RobotError):
 class Limits:
     """Limits of D joints in the contract's order. The first three come from the scene.
 
-    A default without a source is ours: the largest value of the ten shipped policies that walk, in the walking exam
-    with the pushes of its mark (in brackets, 2026-11-29), plus a margin. A robot's class or a contract can set tighter
+    A default without a source is ours: the largest value of the eleven shipped policies that walk, in the walking exam
+    with the pushes of its mark (in brackets, 2026-11-30), plus a margin. A robot's class or a contract can set tighter
     limits.
     """
 
     low: Floats  # (D,) [rad] range of the joints
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] largest torque of the motors
-    position: float = 0.25  # [rad] measured angle beyond the range [0.23: simulated joint limits are soft]
+    position: float = 0.25  # [rad] measured angle beyond the range [0.20: simulated joint limits are soft]
     target: float = 0.9  # [rad] target beyond the range [0.59]
-    step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.99]
-    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.67; go1_rough_scan 2.26, pushed]
-    speed: float = 60.0  # [rad/s] joint speed [53]
-    # [deg] tilt of the body [31]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
+    step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.91]
+    torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.46; go1_rough 2.10, pushed]
+    speed: float = 60.0  # [rad/s] joint speed [59]
+    # [deg] tilt of the body [25]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
     tilt: float = 60.0
     temperature: float = 85.0  # [deg C] of a motor; drives switch off at 90
     voltage: float = -OFF  # [V] lowest voltage of the battery; a robot's class sets it
