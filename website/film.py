@@ -156,7 +156,7 @@ def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
 
 
 def main() -> None:
-    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 216, 168) for shot in FILM]), quality=15)
+    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 288, 216) for shot in FILM]), quality=40)
 
 
 if __name__ == "__main__":
