@@ -26,7 +26,7 @@ from legged_mw.view.drive import Pilot
 from legged_mw.view.panel import Panel
 from legged_mw.view.stage import Moment, ViewError
 from legged_mw.view.stream import Stream
-from legged_mw.view.web import free_port, missing
+from legged_mw.view.web import listen, missing
 
 GO2 = ROOT / "resources/policies/go2_flat"
 
@@ -191,7 +191,8 @@ def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:
     """It serves the page, reports what is wrong before anything moves, and ends with the robot's program."""
     if reason := missing():
         pytest.skip(reason)
-    port = free_port("127.0.0.1")
+    with listen("127.0.0.1") as free:
+        port = free.getsockname()[1]
     args = argparse.Namespace(viewer="web", camera="follow", host="127.0.0.1", port=port)
     with closing(RobotMonitor(GO2, contract, args)) as mirror:
         mirror.show(0.0, measurement(contract), state("stand", ""))

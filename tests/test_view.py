@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -31,7 +32,7 @@ from legged_mw.view.overlay import ARC_SEGMENTS, draw, draw_velocities
 from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.recorder import Recorder, RobotRenderer, VideoWriter, contact_sheet, save_png, shrunk
 from legged_mw.view.session import Pace
-from legged_mw.view.stage import Fall, Moment, top_speed
+from legged_mw.view.stage import Fall, Moment, ViewError, top_speed
 
 LEG = """<body pos="{0} {1} 0"><joint axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" group="2"/>
 <geom name="foot{1}" size=".03" pos="0 0 -.3" group="2"/></body>"""
@@ -121,6 +122,34 @@ def test_broken_run_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: s
     writer.abort()
     writer.close()  # harmless
     assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [(name, b"old")]
+
+
+@pytest.mark.parametrize("name", ["10:30.mp4", "take:1/walk.gif", f"{'x' * 251}.mp4"])
+def test_a_video_may_have_any_name_that_a_file_may_have(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with closing(VideoWriter(name, 320, 240, fps=25)) as writer:
+        writer.add(frames(1)[0])
+    assert [file.name for file in Path(name).parent.iterdir()] == [Path(name).name]
+
+
+@pytest.mark.parametrize("name", ["walk.mp4", "walk.gif"])
+def test_a_disk_that_fills_up_is_said_and_leaves_the_old_file(tmp_path: Path, name: str) -> None:
+    path, noise = tmp_path / name, np.random.default_rng(0)
+    path.write_bytes(b"old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        writer = VideoWriter(path, 320, 240, fps=50)
+        with pytest.raises(ViewError, match=name):
+            for _ in range(60):
+                writer.add(noise.integers(0, 255, (240, 320, 3), dtype=np.uint8))
+            writer.close()
+        writer.abort()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [(name, b"old")]
 
 
 def test_a_gif_needs_no_encoder_of_mp4(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

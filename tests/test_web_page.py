@@ -21,7 +21,7 @@ import pytest
 from legged_mw.utils.commands import Command
 from legged_mw.view.drive import PUSH_MAX, Pilot
 from legged_mw.view.stage import Moment, ViewError
-from legged_mw.view.web import MOST, WebViewer
+from legged_mw.view.web import LOCAL, MOST, WebViewer, listen
 
 SPEC = mujoco.MjSpec.from_string(  # pyright: ignore[reportAttributeAccessIssue]
     "<mujoco><worldbody><geom type='plane' size='1 1 .1'/><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
@@ -131,6 +131,11 @@ def test_the_page_is_served_on_this_machine_alone_and_once_in_a_process(page: We
     with pytest.raises(ViewError, match="--host"):  # which a socket takes for every interface
         WebViewer(SPEC, pilot, host="")
     assert not hasattr(web_viewer, "print"), "Studio's own words are its own again"
+
+
+def test_pages_that_start_at_once_have_ports_of_their_own() -> None:
+    with listen(LOCAL) as first, listen(LOCAL) as second:
+        assert first.getsockname()[1] != second.getsockname()[1]
 
 
 def test_the_page_is_guarded(page: WebViewer, pilot: Pilot) -> None:

@@ -9,7 +9,7 @@ import contextlib
 import os
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.utils.errors import shown
 from legged_mw.view.camera import RobotCamera
 from legged_mw.view.overlay import draw
 from legged_mw.view.posed_robot import PosedRobots, show_groups
@@ -217,15 +218,18 @@ class VideoWriter:
         if (reason := no_encoder(kind)) is not None:
             raise ViewError(reason)
         self.width, self.height, self.frames = width, height, 0
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}.part{kind}")
-        self._open(kind, Fraction(fps).limit_denominator(1001))
+        # absolute: ffmpeg takes what precedes a colon in a relative path for a protocol; short: a name has 255 bytes
+        self._partial = self.path.with_name(f".{self.path.stem[:40]}.{os.getpid()}.part{kind}").absolute()
+        with _writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._open(kind, Fraction(fps).limit_denominator(1001))
 
     def add(self, frame: Frame) -> None:
         """Append one frame (height, width, 3)."""
         picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
         picture.pts, picture.time_base = self.frames, self._time
-        self._palette.push(picture) if self._palette else self._write(picture)
+        with _writing(self.path):
+            self._palette.push(picture) if self._palette else self._write(picture)
         self.frames += 1
 
     def close(self) -> None:
@@ -236,14 +240,15 @@ class VideoWriter:
             self.abort()
             raise ViewError(f"{self.path} was not written: no frame was added.")
         try:
-            if self._palette:
-                self._palette.push(None)
-                with contextlib.suppress(self._av.error.EOFError):
-                    while True:
-                        self._write(self._palette.pull())
-            self._write(None)
-            self._container.close()
-            os.replace(self._partial, self.path)
+            with _writing(self.path):
+                if self._palette:
+                    self._palette.push(None)
+                    with contextlib.suppress(self._av.error.EOFError):
+                        while True:
+                            self._write(self._palette.pull())
+                self._write(None)
+                self._container.close()
+                os.replace(self._partial, self.path)
         except BaseException:
             self.abort()
             raise
@@ -335,6 +340,16 @@ def as_png(frame: Frame) -> bytes:
 
 
 def save_png(path: Path | str, frame: Frame) -> None:
-    """Write one frame as a PNG."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_bytes(as_png(frame))
+    """Write one frame as a PNG. Raises ViewError."""
+    with _writing(path := Path(path)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(as_png(frame))
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Raise ViewError where a file cannot be written: a folder without permission, a full disk."""
+    try:
+        yield
+    except OSError as error:  # also PyAV's
+        raise ViewError(f"cannot write {shown(path)}: {error.strerror or error}") from None

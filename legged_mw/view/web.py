@@ -16,6 +16,7 @@ import os
 import re
 import secrets
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -65,20 +66,22 @@ class WebViewer:
         from legged_mw.view.studio import StudioPlugin  # the import fails if mujoco lacks the web viewer
 
         self.robots = PosedRobots(spec, count)
-        port = free_port(host, port)
+        public = listen(host, port)
         # Studio's NetImgui client is a C++ global: a second one hangs while the first lives, and can crash afterwards
         if WebViewer._opened:
+            public.close()
             raise ViewError(
                 "--viewer web: this process has opened a page, and MuJoCo's web viewer opens one in a process: start another process"
             )
-        self._plugin, gate = StudioPlugin(self.robots, pilot, title), Gate(host, port)
+        self.port: int = public.getsockname()[1]
+        self._plugin, gate = StudioPlugin(self.robots, pilot, title), Gate(host, self.port)
         self._stream = Stream(self.robots, self._plugin.panel)
-        config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
-        with _bound_to(host, gate, self._stream):
+        config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=self.port)
+        with _bound_to(public, gate, self._stream) as served:
             WebViewer._opened = True
             self._handle: Any = launch_web.launch(config, plugins=[self._plugin])
-            self._wait(host, port)
-        self.url, self.port = gate.url(host), port
+            self._wait(host, served)
+        self.url = gate.url(host)
         atexit.register(self.close)  # an open page at exit is a segmentation fault
 
     def show(self, moment: Moment) -> None:
@@ -101,49 +104,49 @@ class WebViewer:
         finally:
             self._stream.close()
 
-    def _wait(self, host: str, port: int) -> None:
+    def _wait(self, host: str, served: threading.Event) -> None:
         """Wait until the page is served. Refuse any interface other than `host`."""
         until = time.monotonic() + START_SECONDS
         # is_running raises the exception of the viewer's thread
-        while not self._listens() and time.monotonic() < until and self._handle.is_running():
-            time.sleep(0.02)
-        if not self._listens():
+        while not served.wait(0.02) and time.monotonic() < until and self._handle.is_running():
+            pass
+        if not (served.is_set() and self._plugin.begun.wait(max(0.0, until - time.monotonic()))):
             self.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
         bound = self._plugin.viewer._http_sock.getsockname()  # pyright: ignore[reportAttributeAccessIssue]
         if host == LOCAL and bound[0] != LOCAL:
             self.close()
             raise ViewError(
-                f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this version of mujoco binds it differently"
+                f"--viewer web: the page would be open to the network ({bound[0]}:{bound[1]}); this version of mujoco binds it differently"
             )
-
-    def _listens(self) -> bool:
-        """Whether the server listens. Its thread starts after the viewer."""
-        return (
-            self._plugin.begun.is_set()
-            and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1  # pyright: ignore[reportAttributeAccessIssue]
-        )
 
 
 @contextmanager
-def _bound_to(host: str, gate: Gate, stream: Stream) -> Iterator[None]:
-    """While Studio starts: bind its socket to `host`, for which it has no setting, add ours, and reduce its log."""
+def _bound_to(public: socket.socket, gate: Gate, stream: Stream) -> Iterator[threading.Event]:
+    """While Studio starts: give it `public`, for which it has no setting, add our pages, and reduce its log.
+
+    The event is set when Studio serves.
+    """
     from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
-    names = ("bind_public_socket", "bind_loopback_socket", "serve")
+    names, served = ("bind_public_socket", "bind_loopback_socket", "serve"), threading.Event()
     bind, inner, serve = (getattr(web_server, name, None) for name in names)
     if bind is None or inner is None or serve is None:
-        raise ViewError(
-            f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host} and guarded"
-        )
+        public.close()
+        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound and guarded")
+
+    def serve_guarded(handler: Any, **settings: Any) -> Any:
+        served.set()
+        return serve(stream.around(handler), **_guarded(settings, gate))
+
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # Studio's banner would name all interfaces
-    web_server.bind_public_socket = lambda _, port=0: bind(host, port)
+    web_server.bind_public_socket = lambda *_, **__: public
     web_server.bind_loopback_socket = OwnSocket  # the link from the page's server to the panel, both in this process
-    web_server.serve = lambda handler, **settings: serve(stream.around(handler), **_guarded(settings, gate))
+    web_server.serve = serve_guarded
     try:
-        yield
+        yield served
     finally:
         del web_viewer.print  # pyright: ignore[reportAttributeAccessIssue]
         web_server.bind_public_socket, web_server.bind_loopback_socket, web_server.serve = bind, inner, serve
@@ -193,27 +196,33 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
     return {**settings, **guard, "max_size": MOST, "open_timeout": PATIENCE}
 
 
-def free_port(host: str, port: int = 0) -> int:
-    """`port` if it is free; for 0 the first free port from FIRST_PORT on. Raises ViewError."""
+def listen(host: str, port: int = 0) -> socket.socket:
+    """A socket that listens on `port`; for 0 on the first free port from FIRST_PORT on. Raises ViewError.
+
+    It listens from here on, so that another program that starts now takes another port.
+    """
     if not host:  # an empty host would mean all interfaces
         raise ViewError(
             f"--host is empty; leave it out for {LOCAL} (this machine only), or name an interface (0.0.0.0: all)"
         )
     candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
     for candidate in candidates:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((host, candidate))
-            except OSError as error:
-                if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-                    raise ViewError(f"--host {host}: this machine has no such address ({error.strerror})") from None
-                if isinstance(error, PermissionError):
-                    raise ViewError(
-                        f"--port {candidate}: this user may not listen there; ports from 1024 on are free for all"
-                    ) from None
-                continue
-            return candidate
+        public = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            public.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if ":" in host:
+                public.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # :: is all addresses, IPv4's too
+            public.bind((host, candidate))
+            public.listen()
+            return public
+        except OSError as error:
+            public.close()
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise ViewError(f"--host {host}: this machine has no such address ({error.strerror})") from None
+            if isinstance(error, PermissionError):
+                raise ViewError(
+                    f"--port {candidate}: this user may not listen there; ports from 1024 on are free for all"
+                ) from None
     if port:
         raise ViewError(
             f"--port {port} is in use on {host}; leave it out and the first free one from {FIRST_PORT} is taken"

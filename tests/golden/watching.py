@@ -10,14 +10,15 @@ from types import SimpleNamespace
 
 import av
 import mujoco
+import numpy as np
 
 from golden.table import Table, patched, without
 from legged_mw.utils.commands import Command
 from legged_mw.view import launch, native, web
 from legged_mw.view.drive import Pilot
 from legged_mw.view.native import NativeViewer
-from legged_mw.view.recorder import RobotRenderer, VideoWriter
-from legged_mw.view.web import WebViewer, free_port
+from legged_mw.view.recorder import RobotRenderer, VideoWriter, save_png
+from legged_mw.view.web import WebViewer, listen
 
 SPEC = """<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
 
@@ -56,7 +57,7 @@ def taken(run: object = None) -> None:
         there.listen()
         port = there.getsockname()[1]
         try:
-            free_port("127.0.0.1", port)
+            listen("127.0.0.1", port)
         except launch.ViewError as error:
             error.args = (str(error).replace(str(port), "<port>"),)
             raise
@@ -76,7 +77,7 @@ class Full(Refusing):
 
 
 def bound(kind: type[Refusing], port: int) -> None:
-    patched(lambda root: free_port("127.0.0.1", port), web.socket, socket=kind)(Path())
+    patched(lambda root: listen("127.0.0.1", port), web.socket, socket=kind)(Path())
 
 
 def unguarded() -> None:
@@ -89,6 +90,11 @@ def unguarded() -> None:
 def table() -> Table:
     made = Table()
     made.add("a video of no frame", no_frame)
+    made.add(
+        "a picture in a folder that is a file",
+        lambda root: save_png(root / "a" / "b.png", np.zeros((1, 1, 3), np.uint8)),
+        lambda root: (root / "a").write_text(""),
+    )
     made.add("a video of odd width", lambda root: VideoWriter(root / "a.mp4", 321, 240, fps=50))
     made.add(
         "no encoder",
@@ -112,7 +118,7 @@ def table() -> Table:
             "web: a port in use": taken,
             "web: a port of others": lambda: bound(Refusing, 80),
             "web: all ports in use": lambda: bound(Full, 0),
-            "web: no such address": lambda: free_port("203.0.113.7"),
+            "web: no such address": lambda: listen("203.0.113.7"),
             "web: none in this mujoco": lambda: patched(
                 lambda root: WebViewer(spec(), Pilot((), 1)), web, missing=lambda: "there is none"
             )(Path()),  # type: ignore[arg-type]
