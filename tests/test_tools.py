@@ -26,9 +26,10 @@ from legged_mw.rl.run_folder import load_tensors, save_whole
 from legged_mw.rl.runner import Runner
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import completion, doctor, sweep, warm
-from legged_mw.tools.compare import read_run
+from legged_mw.tools.compare import find_runs, read_run
 from legged_mw.utils import machine
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.files import wrong_name
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 from legged_mw.view import playing
@@ -303,6 +304,14 @@ def test_compare_prints_figures_exams_and_settings(
     assert curves == [["curves:", "tensorboard", "--logdir", "logs/go1_flat"]]
 
 
+def test_a_run_without_an_exam_is_compared(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    (run / "eval").mkdir()
+    (run / "eval/report.json").write_text(json.dumps({"columns": [{"exam": None}]}))
+    [found] = find_runs([str(run)])
+    assert (found.iterations, found.graded) == (10, {})
+
+
 def said(folder: Path, exam: str = "", end: str = "done: x; watch it with\n") -> str:
     """What a training prints."""
     exam = f"exam after 10 iterations: {exam}\n" if exam else ""
@@ -400,6 +409,9 @@ def test_no_training_outlives_its_sweep(name: str, state: str, tmp_path: Path) -
         (["--set", "algorithm.gama=0.9"], "gama"),
         (["--num_envs", "none"], "--num_envs"),
         (["--nonsense"], "--nonsense"),
+        (["--seed", "3"], "--seed"),  # of all trainings, whatever their names say
+        (["--set", "seed=3"], "seed"),
+        (["--num_envs", "8", "--set", "env.num_envs=16,32"], "--num_envs"),
     ],
 )
 def test_a_wrong_value_is_found_before_the_first_training(
@@ -425,6 +437,13 @@ def test_values_stand_apart_by_commas() -> None:
         sweep.values("1,2") == ["1", "2"] and sweep.values("[1,2],[3]") == ["[1,2]", "[3]"] and sweep.values("") == []
     )
     assert sweep.values("{a: [1,2]},'x,y'") == ["{a: [1,2]}", "'x,y'"]
+
+
+def test_many_values_make_a_name_that_a_folder_can_have() -> None:
+    settings = [f"{section}.hidden_dims=[512,256,128,64,64,64,64],[256,128,64]" for section in ("actor", "critic")]
+    cells = sweep.make_cells([*settings, "rewards.scales.tracking_lin_vel=1,2", "rewards.scales.torques=1,2"], [])
+    labels = [cell.label for cell in cells]
+    assert len(cells[0].name) > 100 and len({*labels}) == 16 and not any(map(wrong_name, labels))
 
 
 def test_a_log_says_where_a_training_writes_and_how_it_ended(tmp_path: Path) -> None:

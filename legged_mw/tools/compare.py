@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from legged_mw.utils.cli import Parser
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown
+from legged_mw.utils.files import typed
 
 CONFIG_FILE = "config.yaml"
 PAUSE = 60.0  # [s] ours: a longer iteration includes a pause, such as before a resume
@@ -67,7 +68,7 @@ def find_runs(names: list[str]) -> list[Run]:
 
 
 def _find(name: str) -> Path:
-    path, logs = Path(name).expanduser(), Path.cwd() / "logs"
+    path, logs = typed(name), Path.cwd() / "logs"
     for folder in (path, logs / name):
         if _events(folder):
             return folder
@@ -105,7 +106,7 @@ def read_run(folder: Path, name: str) -> Run:
 def _graded(report: Path) -> dict[str, float]:
     """The numeric figures of the exam in a report; empty without a report."""
     try:
-        exam = json.loads(report.read_text(encoding="utf-8"))["columns"][0]["exam"]
+        exam = dict(json.loads(report.read_text(encoding="utf-8"))["columns"][0]["exam"])
     except (OSError, ValueError, LookupError, TypeError):
         return {}
     values = dict(_flat({name: each for name, each in exam.items() if name != "rules"}))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import hashlib
 import math
 import os
 import re
@@ -28,9 +29,9 @@ from typing import NamedTuple
 
 from legged_mw.rl import flags
 from legged_mw.tools.compare import Run, curves_of, figures, find_runs, rows, text_table
-from legged_mw.utils.cli import Parser, apply_overrides, command, positive
+from legged_mw.utils.cli import FIELDS, Parser, apply_overrides, command, positive
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.files import check_name
+from legged_mw.utils.files import MOST_LETTERS, check_name, writable, wrong_name
 from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training that a signal stopped (rl/training.py)
@@ -60,8 +61,12 @@ class Cell(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The name, with only characters that are valid in a file name."""
-        return re.sub(r"[^\w.=-]+", "_", self.name).strip("_")
+        """The name as a valid name of a run. One that is too long is cut, and a digest of the whole is added."""
+        label = re.sub(r"[^\w.=-]+", "_", self.name).strip("_")
+        if wrong_name(label):
+            cut = label.encode()[: MOST_LETTERS - 10].decode(errors="ignore")
+            label = f"{cut}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
+        return label
 
 
 def _named(varied: Mapping[str, str]) -> str:
@@ -197,6 +202,12 @@ def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
 def check(cells: Sequence[Cell], common: list[str]) -> tuple[argparse.Namespace, LoadedTask]:
     """Parse all flags and values once, as train does. An invalid one raises UserError or ends the program."""
     args = flags.parse(None, common)
+    fields = [text.partition("=")[0].strip() for text in cells[0].flags if text != "--set"]
+    if twice := [field for field in fields if fields.count(field) > 1]:
+        raise UserError(f"{twice[0]} has two lists of values, and only one can count: give it once")
+    for flag, field in FIELDS.items():
+        if field in fields and getattr(args, flag, None) is not None:
+            raise UserError(f"--{flag} would replace the values of {field}: leave one of them out")
     args.set += dict.fromkeys(text for cell in cells for text in cell.flags if text != "--set")
     apply_overrides(task := load_task(args.task, say=True), args)
     return args, task
@@ -346,7 +357,7 @@ class Halving:
             raise UserError(f"--halve ranks by the exam at the end of a training, and {reason}")
         self.cells, self.seconds = {cell.label: cell for cell in cells}.values(), train_args.max_time
         name = check_name(train_args.experiment_name or f"{self.task.name}_halving", "--experiment_name")
-        self.folder = Path.cwd() / "logs" / name
+        self.folder = writable(str(Path.cwd() / "logs" / name), "--experiment_name", folder=True)
         self.common = [*NO_END, *common, "--experiment_name", name]
         settings = [text for item in args.set for text in ("--set", item)]
         self._claim(shlex.join([*common, *settings, "--seeds", args.seeds]))

@@ -20,6 +20,11 @@ from legged_mw.utils.config import ConfigError, fit, load_yaml
 from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
+FIELDS = {  # flag of train or play -> the config field that it sets
+    **{"num_envs": "env.num_envs", "seed": "seed", "engine": "sim.engine"},
+    **{"teacher": "distillation.teacher", "init": "warm_start.policy"},
+    **{name: f"runner.{name}" for name in ("max_iterations", "experiment_name", "run_name")},
+}
 FEWER_WORLDS = "; fewer worlds need less: try half with --num_envs"  # for programs with this flag
 
 
@@ -81,10 +86,7 @@ def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
         if not equals:
             raise ConfigError(f"--set {item}: write it as path=value, e.g. rewards.scales.torques=-1e-4")
         task.set(path.strip(), value.strip(), where=f"--set {item}")
-    flags = {"num_envs": "env.num_envs", "seed": "seed", "engine": "sim.engine"}
-    flags |= {"teacher": "distillation.teacher", "init": "warm_start.policy"}
-    flags |= {name: f"runner.{name}" for name in ("max_iterations", "experiment_name", "run_name")}
-    for flag, path in flags.items():
+    for flag, path in FIELDS.items():
         value = getattr(args, flag, None)
         if value is not None:
             task.set(path, value, where=f"--{flag}")

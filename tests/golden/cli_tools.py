@@ -35,12 +35,14 @@ MOTION = [
     f"{WAVE} --rate 0.01",
 ]
 MOTION += [f"{WAVE} --task go1_flat", f"{WAVE} --lift nan", f"{WAVE} --task nosuch", "words.csv", "narrow.csv"]
-COMPARE = ["", "nosuch", "nosuch --over days", "nosuch --out a.html", "a/../b"]
+COMPARE = ["", "nosuch", "~nosuch", "nosuch --over days", "nosuch --out a.html", "a/../b"]
 SWEEP = ["", "--task go1_flat --resume", "--task go1_flat --seeds 1,x", "--task go1_flat --run_name a"]
 SWEEP += ["--task go1_flat --rounds 2", "--task go1_flat --jobs 0", "--task go1_flat --halve --init a"]
 SWEEP += ["--task go1_flat --halve --seeds 1,2 --max_time 60s"]
+SWEEP += ["--task go1_flat --seeds 1,2 --seed 3", "--task go1_flat --seeds 1,2 --set seed=3"]
 GAMMAS = "--task go1_flat --halve --set algorithm.gamma=0.9,0.97"
 SWEEP += [GAMMAS, f"{GAMMAS} --max_time 60s", f"{GAMMAS} --max_time 60s --set runner.exam_interval=0"]
+SWEEP += [f"{GAMMAS} --max_time 60s --experiment_name file"]
 
 
 def fill(root: Path) -> None:
@@ -49,6 +51,7 @@ def fill(root: Path) -> None:
     for name, text in {
         "there.xml": "",
         "folder/there.xml": "",
+        "logs/file": "",
         "words.csv": "a,b\nc,d\n",
         "narrow.csv": "1,2,3\n4,5,6\n",
         "logs/go1_flat_halving/sweep.txt": "--task go1_flat --seeds 1,2",
