@@ -374,6 +374,15 @@ def test_memory_that_runs_out_gives_advice(text: str, capsys: pytest.CaptureFixt
         raise RuntimeError("something else")
 
 
+def test_a_library_that_is_missing_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"), one_line_errors("train.py"):
+        raise ModuleNotFoundError("No module named 'tensorboard'", name="tensorboard")
+    said = capsys.readouterr().err
+    assert said.startswith("train.py: No module named 'tensorboard'; ") and said.count("\n") == 1
+    with pytest.raises(ModuleNotFoundError), one_line_errors("train.py"):  # ours
+        raise ModuleNotFoundError("No module named 'legged_mw.nothing'", name="legged_mw.nothing")
+
+
 def test_a_reader_that_left_ends_nothing() -> None:
     """As in ``legged-mw play ... | head``, which closes the pipe; the robot whose command is refused comes to its line all the same."""
     reader, writer = os.pipe()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 
 from legged_mw import ROOT, programs
+from legged_mw import eval as eval_package
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exams, plots, report, rollout
 from legged_mw.eval.report import Column
@@ -224,6 +226,15 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     draw = plots.sections
     chosen = ("pushes", "energy")
     monkeypatch.setattr(plots, "sections", lambda *args: [each for each in draw(*args) if each.name in chosen])
+
+
+def test_the_figures_are_kept_where_nothing_can_draw_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An exam took minutes; that matplotlib is missing must not lose it."""
+    monkeypatch.delattr(eval_package, "plots")
+    monkeypatch.setitem(sys.modules, plots.__name__, None)
+    with pytest.raises(ImportError):
+        report.write(tmp_path, "go1_flat", [Column("mine", {}, {"rules": GO1.to_mapping(), "falls": 3})])
+    assert json.loads((tmp_path / "report.json").read_text())["columns"][0]["exam"]["falls"] == 3
 
 
 def test_a_task_without_a_peer(few: None, both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:

@@ -227,6 +227,17 @@ def test_doctor_fails_where_nothing_can_train(
     )
 
 
+def test_doctor_goes_on_without_torch(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: "" if name == "torch" else version(name))
+    monkeypatch.setattr(doctor, "draws", lambda name: "")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(SystemExit, match="1"):
+        program("doctor", monkeypatch=monkeypatch)
+    said = capsys.readouterr().out
+    assert "\nExtras\n" in said and "  torch: pip install" in said
+
+
 def test_drawing_is_tried_in_another_process() -> None:
     assert (
         doctor.draws("no such thing") == "RuntimeError: invalid value for environment variable MUJOCO_GL: no such thing"

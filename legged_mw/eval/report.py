@@ -357,8 +357,6 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
 
     All columns are compared with the first column, by its rules. At most two columns have figures.
     """
-    from legged_mw.eval import plots  # imports matplotlib, which takes a second
-
     folder.mkdir(parents=True, exist_ok=True)
     rules = ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column.plain() for column in columns]}
@@ -368,6 +366,8 @@ def write(folder: Path, task: str, columns: Sequence[Column]) -> None:
     if rules.peers:
         content |= {"peer": best_of(rules.peers), "peers": [peer._asdict() for peer in rules.peers]}
     (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    from legged_mw.eval import plots  # imports matplotlib, which takes a second, or is missing: the figures are kept
+
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], rules)
     page = walking_page(task, rules, columns, [(section, plots.svgs(section)) for section in sections])
     (folder / "report.html").write_text(page, encoding="utf-8")

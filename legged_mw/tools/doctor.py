@@ -127,9 +127,12 @@ def main() -> None:
     )
     for title, find in sections:
         print(f"\n{title}")
-        for finding in find():
-            print(f"  {'!' if finding.mend else ' '} {finding.what:<14} {finding.said}", flush=True)
-            missing += [finding] * bool(finding.mend)
+        try:
+            for finding in find():
+                print(f"  {'!' if finding.mend else ' '} {finding.what:<14} {finding.said}", flush=True)
+                missing += [finding] * bool(finding.mend)
+        except ImportError as error:  # of a library that Training has named
+            print(f"    not known: {error}", flush=True)
     if seconds > 0 and not any(finding.needed for finding in missing):
         device = pick_device(device_flag)
         print(f"\nSpeed on {device}, {seconds:g} s", flush=True)

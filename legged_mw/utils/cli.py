@@ -178,6 +178,9 @@ def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
         if where := users_fault(error):
             _show_all()
             fail(program, f"{where}: {in_short(error)}; --verbose shows the whole traceback")
+        if isinstance(error, ModuleNotFoundError) and not f"{error.name}".startswith("legged_mw"):
+            _show_all()
+            fail(program, f"{error}; legged-mw doctor says how to install what is missing")
         raise
 
 
