@@ -27,7 +27,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.flags import require_task
 from legged_mw.rl.learner_config import check_classes
-from legged_mw.rl.policies import PolicySource, actor_in, introduce, load_policy
+from legged_mw.rl.policies import NETWORK_FILE, PolicySource, actor_in, introduce, load_policy
 from legged_mw.rl.run_folder import checkpoints, load_tensors, reason_of, save_whole
 from legged_mw.rl.students.estimator import believed_velocity
 from legged_mw.rl.students.recurrent import forget
@@ -37,6 +37,7 @@ from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.machine import has_display
 from legged_mw.utils.task import LoadedTask
@@ -188,6 +189,10 @@ def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
 
 def watch(source: PolicySource, task: LoadedTask, commands: tuple[Command, ...], args: argparse.Namespace) -> None:
     """Show the policy in the environment of the prepared task. ``commands`` have their trained ranges."""
+    if args.follow and source.checkpoint.name == NETWORK_FILE:
+        raise launch.FlagError(
+            f"--follow watches a run as it trains on, and {shown(source.checkpoint)} is an export: name a run, --load_run RUN"
+        )
     device = pick_device(args.device)
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)

@@ -13,8 +13,9 @@ import mujoco
 import numpy as np
 
 from golden.table import Table, patched, without
+from legged_mw.rl.policies import NETWORK_FILE, PolicySource
 from legged_mw.utils.commands import Command
-from legged_mw.view import launch, native, web
+from legged_mw.view import launch, native, playing, web
 from legged_mw.view.drive import Pilot
 from legged_mw.view.native import NativeViewer
 from legged_mw.view.recorder import RobotRenderer, VideoWriter, save_png
@@ -80,6 +81,11 @@ def bound(kind: type[Refusing], port: int) -> None:
     patched(lambda root: listen("127.0.0.1", port), web.socket, socket=kind)(Path())
 
 
+def followed() -> None:
+    source = PolicySource(Path("export"), Path("export") / NETWORK_FILE, shipped=False)
+    playing.watch(source, None, (), SimpleNamespace(follow=True))  # type: ignore[arg-type]
+
+
 def unguarded() -> None:
     from mujoco.studio.web import web_server
 
@@ -112,6 +118,7 @@ def table() -> Table:
     )
     made.calls(
         {
+            "an export is followed": followed,
             "a window without a display": lambda: window(False),
             "a window that cannot be opened": lambda: window(True),
             "a window of a Mac": mac,
