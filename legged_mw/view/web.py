@@ -215,10 +215,11 @@ def listen(host: str, port: int = 0) -> socket.socket:
             public.bind((host, candidate))
             public.listen()
             return public
-        except OSError as error:
+        except (OSError, TypeError) as error:  # the latter for a name that no host can have
             public.close()
-            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-                raise ViewError(f"--host {host}: this machine has no such address ({error.strerror})") from None
+            if isinstance(error, socket.gaierror | TypeError) or error.errno == errno.EADDRNOTAVAIL:
+                why = getattr(error, "strerror", None) or error
+                raise ViewError(f"--host {host}: this machine has no such address ({why})") from None
             if isinstance(error, PermissionError):
                 raise ViewError(
                     f"--port {candidate}: this user may not listen there; ports from 1024 on are free for all"

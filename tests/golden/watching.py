@@ -125,6 +125,7 @@ def table() -> Table:
             "web: a port in use": taken,
             "web: a port of others": lambda: bound(Refusing, 80),
             "web: all ports in use": lambda: bound(Full, 0),
+            "web: no name of a host": lambda: listen("\u00fc..b"),
             "web: no such address": lambda: listen("203.0.113.7"),
             "web: none in this mujoco": lambda: patched(
                 lambda root: WebViewer(spec(), Pilot((), 1)), web, missing=lambda: "there is none"
