@@ -144,7 +144,7 @@ class SimToRealRoughCfg(SimToRealCfg):
 class TrotRoughCfg(SimToRealRoughCfg):
     """A quadruped of a Go2's size that trots on rough ground by a clock, on robots that differ.
 
-    Numbers without a source: [ours: docs/archive/go2_and_g1.md, stairs that are seen].
+    Numbers without a source: [ours: docs/archive/go2_and_g1.md, from "stairs that are seen" on].
     """
 
     class gait(TrotCfg.gait):

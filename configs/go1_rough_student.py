@@ -7,7 +7,7 @@ from legged_mw.utils.task import Task
 
 class Go1RoughStudentCfg(Go1RoughCfg):
     class observations(Go1RoughCfg.observations):
-        leave_out = {"state": ["base_lin_vel"]}  # 45 values; the critic has it
+        leave_out = {"state": ["base_lin_vel"]}  # 53 values; the critic has it
         history = {"state": 10}  # frames [genesis_lr]: a step is felt, not seen
 
 

@@ -155,8 +155,7 @@ def test_a_run_named_by_its_task_is_graded_by_its_export(tmp_path: Path, monkeyp
 def test_deploy_yaml_acts_as_the_contract_does(tmp_path: Path) -> None:
     """The file is read as unitree_rl_lab's C++ does it: terms in order, scaled, gains by motor, offset plus scale."""
     no_clock = {"gait.period": 0.0, "gait.offsets": [], "rewards.scales.contact_phase": 0.0}
-    settings = no_clock | {"observations.history": {}}
-    export(*untrained(ROOT / "configs/go2_flat.py", tmp_path, settings), folder := tmp_path / "export")
+    export(*untrained(ROOT / "configs/go2_rough.py", tmp_path, no_clock), folder := tmp_path / "export")
     contract = read_contract(folder)
     deploy_yaml.write(folder, contract, tmp_path)
     said = yaml.safe_load((tmp_path / "params/deploy.yaml").read_text())
@@ -172,11 +171,12 @@ def test_deploy_yaml_acts_as_the_contract_does(tmp_path: Path) -> None:
         "joint_vel_rel": measured.joint_vel[0],
         "last_action": np.zeros(12),
     }
-    obs = np.concatenate([terms[name] * term["scale"] for name, term in said["observations"].items()]).astype(
-        np.float32
-    )
+    frames = [
+        np.tile(terms[name] * term["scale"], term["history_length"]) for name, term in said["observations"].items()
+    ]
+    obs = np.concatenate(frames).astype(np.float32)
     network = onnxruntime.InferenceSession(tmp_path / "exported/policy.onnx")
-    assert network.get_inputs()[0].shape == [1, 45]
+    assert network.get_inputs()[0].shape == [1, 5 * 45]
     action = said["actions"]["JointPositionAction"]
     acted = network.run(["actions"], {"obs": obs[None]})[0][0] * action["scale"] + action["offset"]
     low, high = np.array(action["clip"]).T
