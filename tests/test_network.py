@@ -156,5 +156,5 @@ def test_a_file_that_is_missing_damaged_or_of_another_task(tmp_path: Path) -> No
     (tmp_path / "policy.onnx").write_bytes((SHIPPED / "policy.onnx").read_bytes()[:5000])
     with pytest.raises(ConfigError, match="policy.onnx cannot be read as an ONNX network: it is damaged"):
         loaded(tmp_path / "policy.onnx", SHIPPED)
-    with pytest.raises(ConfigError, match=r"does not fit this task: actor .* is \(.*235\) there and \(.*48\) here"):
+    with pytest.raises(ConfigError, match=r"does not fit this task: actor .* is \(.*243\) there and \(.*48\) here"):
         loaded(ROOT / "resources/policies/go1_rough_scan/policy.onnx", SHIPPED)

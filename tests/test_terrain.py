@@ -219,7 +219,7 @@ def test_the_kind_in_the_docs_is_ground_that_a_task_can_have(tmp_path: Path) -> 
     (tmp_path / "go1_craters.py").write_text(code)
     for _ in range(2):  # train.py and play.py load it more than once
         task = load_task(str(tmp_path / "go1_craters.py"))
-    for path, value in {"terrain.num_rows": 2, "terrain.num_cols": 4}.items():
+    for path, value in {"terrain.num_rows": 2, "terrain.num_cols": 4, "terrain.difficulty": [0.0, 1.0]}.items():
         task.set(path, value)
     ground = build_terrain(task.cfg)
     assert ground is not None and "craters" in ground.kinds
