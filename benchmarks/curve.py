@@ -1,7 +1,7 @@
 """The learning curve of a run as curve.csv and curve.webp: python benchmarks/curve.py logs/go2_flat/<time> resources/policies/go2_flat
 
 Seconds are of training: from the end of its first iteration, which records the step and compiles kernels that are not cached. Pauses are
-left out: where a run was resumed, or an iteration took over 5 s, and three times as long as half of them, for another reason.
+left out: where a run was resumed, or an iteration took over 5 s and over three times the median for another reason.
 """
 
 from __future__ import annotations
@@ -71,18 +71,17 @@ def draw(curve: dict[str, dict[int, float]], path: Path) -> None:
     levels, exams = "terrain_level" in curve, "error_vx" in curve
     panels = 1 + levels + exams
     figure, axes = plt.subplots(1, panels, figsize=(4.5 * panels, 3.2), layout="constrained", squeeze=False)
-    left, middle, right = axes[0, 0], axes[0, 1 if levels else 0], axes[0, -1]
+    left, right = axes[0, 0], axes[0, -1]
     seconds = curve["seconds"]
     left.plot([*seconds.values()], [curve["reward"][step] for step in seconds], lw=1)
-    left.set(xlabel="seconds of training", ylabel="return of an episode")
-    left.grid(alpha=0.3)
+    left.set(ylabel="return of an episode")
     if levels:
+        middle = axes[0, 1]
         for column, label in (("terrain_level", "all kinds"), ("stairs_up", "stairs up")):
             values = curve.get(column, {})
             middle.plot([seconds[step] for step in values], [*values.values()], lw=1, label=label)
-        middle.set(xlabel="seconds of training", ylabel="mean level of the ground")
+        middle.set(ylabel="mean level of the ground")
         middle.legend(frameon=False)
-        middle.grid(alpha=0.3)
     if exams:
         for column, unit in (("error_vx", "m/s"), ("error_vy", "m/s"), ("error_yaw", "rad/s")):
             values = curve[column]
@@ -94,9 +93,11 @@ def draw(curve: dict[str, dict[int, float]], path: Path) -> None:
                 lw=1,
                 label=f"{column} [{unit}]",
             )
-        right.set(xlabel="seconds of training", ylabel="small exam, mean error", ylim=(0, 0.5))
+        right.set(ylabel="small exam, mean error", ylim=(0, 0.5))
         right.legend(frameon=False)
-        right.grid(alpha=0.3)
+    for panel in axes[0]:
+        panel.set(xlabel="seconds of training")
+        panel.grid(alpha=0.3)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=100)
     small = (

@@ -118,12 +118,8 @@ def test_a_student_is_exported_and_deployed(
     student: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     contract = read_contract(student / "export")
-    assert [(row.name, row.history) for row in contract.rows] == [
-        (name, 10)
-        for name in (
-            *("base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "gait_clock", "commands"),
-        )
-    ]
+    names = ("base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "gait_clock", "commands")
+    assert [(row.name, row.history) for row in contract.rows] == [(name, 10) for name in names]
     weights = {
         each.name: numpy_helper.to_array(each)
         for each in onnx.load(str(student / "export/policy.onnx")).graph.initializer

@@ -136,6 +136,12 @@ class GraphedPPO(Recorded, PPO):
             reason = "rnd_cfg is set"
         elif not {*map(id, actor.parameters())}.isdisjoint(map(id, critic.parameters())):
             reason = "the networks share parameters"
+        symmetry = settings.get("symmetry_cfg") if actor.is_recurrent or critic.is_recurrent else None
+        if symmetry and (reason or not symmetry["use_data_augmentation"]):
+            raise ConfigError(
+                "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both "
+                "this project's recorded update; switch the former on, or both off"
+            )
         if not reason:
             return super().__new__(cls)
         if settings.pop("max_learning_rate", None):
@@ -152,7 +158,11 @@ class GraphedPPO(Recorded, PPO):
         )
         super().__init__(actor, critic, storage, symmetry_cfg=None if self._recurrent else symmetry, **settings)
         if self._recurrent:
-            _check_recurrent(storage.num_envs, self.num_mini_batches, symmetry)
+            if storage.num_envs < self.num_mini_batches:
+                raise ConfigError(
+                    f"algorithm.num_mini_batches is {self.num_mini_batches}, but a recurrent network learns from whole "
+                    f"worlds, and env.num_envs is {storage.num_envs}: raise the latter or lower the former"
+                )
             self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl rejects it for recurrent networks
         self._parts, own_rates = trained_parts(self.actor, self.critic)
         self._rates = [self._adam_rate, *own_rates]
@@ -463,20 +473,6 @@ class GraphedPPO(Recorded, PPO):
     def learning_rate(self, rate: float) -> None:
         self.rate.fill_(float(rate))
         self._adam_rate.fill_(float(rate))
-
-
-def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None) -> None:
-    """Raise ConfigError for settings that do not work with a recurrent network."""
-    if worlds < minibatches:
-        raise ConfigError(
-            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, "
-            f"and env.num_envs is {worlds}: raise the latter or lower the former"
-        )
-    if symmetry and not symmetry["use_data_augmentation"]:
-        raise ConfigError(
-            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both "
-            "this project's recorded update; switch the former on, or both off"
-        )
 
 
 # ---- the rollback of an update --------------------------------------------------------------------------------------
