@@ -1,7 +1,8 @@
 """A policy between two trainings, as a run: python benchmarks/mean_policy.py FROM/model_750.pt TO/model_2590.pt 0.7 logs/g1_12dof_flat/mean
 
-Each weight is FROM + share * (TO - FROM). It works where TO began with FROM (train.py --init). The config and the critic are TO's.
-Without an optimizer the run can be played and exported, not resumed. Source: Wortsman et al. 2022, Robust fine-tuning of zero-shot models.
+Each weight is FROM + share * (TO - FROM). It works where TO began with FROM, or both with one policy (train.py --init).
+The config and the critic are TO's. Without an optimizer the run can be played and exported, not resumed.
+Source: Wortsman et al. 2022, Robust fine-tuning of zero-shot models.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ def between(before: dict[str, Any], after: dict[str, Any], share: float) -> dict
     """Floating-point tensors are mixed; what else a model holds, such as counts, is ``after``'s."""
     if {name: value.shape for name, value in before.items()} != {name: value.shape for name, value in after.items()}:
         raise SystemExit(
-            "the two checkpoints hold networks of different sizes or names; the second must begin with the first"
+            "the two checkpoints hold networks of different sizes or names; the second must begin with the first, or both with one policy"
         )
     return {
         name: torch.lerp(before[name], value, share) if value.is_floating_point() else value

@@ -123,7 +123,7 @@ LEARNERS: dict[str, list[str]] = {
     "a GRU": ["go1_flat_blind", "--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=16"],
     "an estimator": ["go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
     "a teacher beside": ["go1_rough_student", "--set", "actor.concurrent.groups=[privileged_state]"],
-    "a student": ["go1_rough_student", "--teacher", "{root}/resources/policies/go1_rough_scan"],
+    "a student": ["go2_rough", "--teacher", "{root}/resources/policies/go2_rough_scan"],
     "a warm start": [
         "go2_flat",
         "--init",
