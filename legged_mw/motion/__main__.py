@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from legged_mw.motion.foreign import CSV_FPS, read_motion
 from legged_mw.motion.look import ClipStage, page
 from legged_mw.sim.model import RobotModel
 from legged_mw.skills.clip import Clip, ClipError, save_clip
-from legged_mw.utils.bounds import Positive
+from legged_mw.utils.bounds import above
 from legged_mw.utils.cli import Parser, duration, number, one_line_errors
 from legged_mw.utils.errors import shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.task import load_task
 from legged_mw.view import launch
+
+Rate = Annotated[float, above(0, 1000)]  # frames a second
 
 
 def parse() -> argparse.Namespace:
@@ -26,12 +29,12 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--task", default="g1_track", metavar="NAME", help="whose robot moves so (default: g1_track)")
     parser.add_argument(
         "--fps",
-        type=number(Positive),
+        type=number(Rate),
         metavar="F",
         help=f"frames a second, if the file does not say (a CSV: {CSV_FPS:g})",
     )
     parser.add_argument(
-        "--rate", type=number(Positive), default=50.0, metavar="F", help="frames a second to resample to (default: 50)"
+        "--rate", type=number(Rate), default=50.0, metavar="F", help="frames a second to resample to (default: 50)"
     )
     parser.add_argument("--cut", type=number(float), nargs=2, metavar=("FROM", "TO"), help="keep only these seconds")
     parser.add_argument("--lift", type=number(float), default=0.0, metavar="M", help="raise it by so many metres")

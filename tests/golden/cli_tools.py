@@ -33,6 +33,7 @@ MOTION = [
     f"{WAVE} --cut 0 99",
     f"{WAVE} --rate 0",
     f"{WAVE} --rate 0.01",
+    f"{WAVE} --rate 1e6",
 ]
 MOTION += [f"{WAVE} --task go1_flat", f"{WAVE} --lift nan", f"{WAVE} --task nosuch", "words.csv", "narrow.csv"]
 COMPARE = ["", "nosuch", "~nosuch", "nosuch --over days", "nosuch --out a.html", "a/../b"]
