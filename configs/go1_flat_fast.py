@@ -6,7 +6,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.utils.task import Task
 
 
-# all [ours]: five of five seeds walk at their end, after 90 s, and three beat the peer; docs/lab.md
+# all [ours]: five of five seeds walk at their end, after about 90 s, and three beat the peer; docs/lab.md
 class Go1FlatFastCfg(Go1FlatCfg):
     class gait(Go1FlatCfg.gait):
         period = 0.4  # [s]
