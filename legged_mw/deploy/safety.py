@@ -69,7 +69,7 @@ class Limits:
     step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.91]
     torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.46; go1_rough 2.10, pushed]
     speed: float = 60.0  # [rad/s] joint speed [55; go1_rough 59, pushed]
-    # [deg] tilt of the body [25]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
+    # [deg] tilt of the body [20]. The contract's `max_tilt` replaces it if less or above 90; off without `max_tilt`
     tilt: float = 60.0
     temperature: float = 85.0  # [deg C] of a motor; drives switch off at 90
     voltage: float = -OFF  # [V] lowest voltage of the battery; a robot's class sets it
