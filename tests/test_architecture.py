@@ -24,12 +24,8 @@ SOURCES = {path: (ROOT / path).read_text() for path in FILES}
 MAX_FUNCTION = 60  # lines of one that reads as one story; a file is as long as its concept
 
 MAX_ROBOT, MAX_TASK = 85, 20  # lines of a file in configs/robots/ and in configs/
-SPELL_OUT = (
-    "go1_flat",
-    "go1_flat_fast",
-    "go1_rough",
-    "go1_rough_student",
-)  # tasks of more lines: each number, and where it is from
+# tasks of more lines: each number, and where it is from
+SPELL_OUT = ("go1_flat", "go1_flat_fast", "go1_rough", "go1_rough_student")
 
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
 LAYERS = ("utils", "sim", "envs", "rl")
