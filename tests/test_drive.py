@@ -365,7 +365,8 @@ def test_the_summary_of_a_script_has_a_row_a_command(tmp_path: Path) -> None:
         FakeStage(2), FakeViewer(pilot), pilot, seconds=drive.seconds, real_time=False, script=drive
     ).run()
     assert [(round(each.start, 2), round(each.seconds, 2)) for each in outcome.segments] == [(0, 3), (3, 3)]
-    title, row = outcome.text().splitlines()[1:3]
+    said, title, row = outcome.text().splitlines()[:3]
+    assert said == "6.0 s, 0 falls of 2 robots"
     assert title == "    from     for   commanded: vx [m/s], vy [m/s], yaw rate [rad/s]   measured: vx, vy, yaw rate"
     assert row.split() == ["0.0", "s", "3.0", "s", "+0.50", "+0.00", "+0.00", "+0.51", "+0.01", "+0.01"]
     assert row.index("+0.51") == title.index("measured")

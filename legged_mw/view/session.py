@@ -38,10 +38,12 @@ class Outcome(NamedTuple):
     falls: int  # number of falls of all robots
     segments: list[Segment]
     table: Sequence[Command] = ()
+    robots: int = 1
 
     def text(self) -> str:
         """A summary line, then a table of at most the last twenty segments."""
-        lines = [f"{self.seconds:.1f} s, {self.falls} {'fall' if self.falls == 1 else 'falls'}"]
+        of = f" of {self.robots} robots" if self.robots > 1 else ""
+        lines = [f"{self.seconds:.1f} s, {self.falls} {'fall' if self.falls == 1 else 'falls'}{of}"]
         commanded = f"commanded: {with_units(self.table) or 'nothing'}"
         if self.segments:
             lines.append(f"{'from':>8}{'for':>8}   {commanded}   measured: {MEASURED}")
@@ -111,7 +113,7 @@ class Session:
         except KeyboardInterrupt:
             print("\nstopped", flush=True)
         self._end_segment()
-        return Outcome(self.time, self.falls, self._segments, self.stage.command_table)
+        return Outcome(self.time, self.falls, self._segments, self.stage.command_table, self.stage.num_worlds)
 
     def turn(self) -> None:
         """Show the moment, then do one control step under the pilot's commands."""
