@@ -770,7 +770,7 @@ def load_robot(
         return build_model(
             find_file(cfg, "asset.file"),
             solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
-            ground=Ground(on.friction, on.condim, terrain, boxes=engine == "mujoco", slope=on.slope),
+            ground=Ground(on.friction, on.condim, on.contact_time, terrain, boxes=engine == "mujoco", slope=on.slope),
             **motor_gains(cfg, law),
             colliders=asset.colliders,
             self_collisions=asset.self_collisions,

@@ -226,6 +226,7 @@ class RobotTaskCfg(Config):
     class terrain:
         friction: NonNegative = 0.6  # sliding friction of the ground, used instead of the robot's [-] [P]
         condim: Literal[1, 3, 4, 6] = 3  # contact dimensions: 3 is sliding without torsion [P]
+        contact_time: NonNegative = 0.0  # [s] of its contacts (solref): longer is softer; 0: MuJoCo's 0.02 [ours]
         slope: Slope = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it do not
 
     class sim:

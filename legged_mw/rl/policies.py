@@ -6,6 +6,7 @@ import copy
 import shutil
 from collections.abc import Iterable, Sequence
 from inspect import getfile
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -310,27 +311,65 @@ def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
 
 
 def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
-    """Raise ConfigError unless rows and actions of ``policy`` have the same meaning as those of ``task``'s actor."""
-    theirs = _observe(env, policy, "the policy to begin with").rows(TEACHER)
-    ours = [row for group in task.train.obs_groups.actor for row in env.observations.rows(group)]
-    if [*map(_layout, theirs)] != [*map(_layout, ours)]:
+    """Raise ConfigError unless rows and actions of ``policy`` have the same meaning as those of ``task``'s actor.
+
+    A row may have more frames here than there, if it has one there.
+    """
+    theirs, ours = _rows_of(env, policy, task.train.obs_groups.actor)
+    frames = [row.history for row in theirs]
+    known = [row._replace(history=1) if one == 1 else row for row, one in zip_longest(ours, frames) if row]
+    if [*map(_layout, theirs)] != [*map(_layout, known)]:
         raise ConfigError(
             f"{shown(policy.source.checkpoint)}: it reads {_in_words(theirs)}; "
             f"the actor of {task.name} reads {_in_words(ours)}"
         )
 
 
-def begin_with(model: MLPModel, policy: Trained) -> None:
-    """Load the actor's parameters into ``model``, except its exploration noise. Raises ConfigError."""
+def begin_with(model: MLPModel, policy: Trained, env: RobotTask | None = None) -> None:
+    """Load the actor's parameters into ``model``, except its exploration noise. Raises ConfigError.
+
+    ``env``: where ``check_start`` was called. Weights of frames that ``policy`` does not read are 0.
+    """
     path, own = policy.source.checkpoint, model.state_dict()
     if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
         raise ConfigError(f"{shown(path)} has only the student, not the teacher's encoder; name a checkpoint")
-    saved = read_actor(path, model)
+    theirs, ours = _rows_of(env, policy, model.obs_groups) if env else ([], [])
+    if [row.history for row in theirs] == [row.history for row in ours]:
+        saved = read_actor(path, model)
+    else:
+        saved = _read_newest(path, model, theirs, ours)
     # the normalisers of observations and of targets
     for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:
         of = name.removesuffix("_std")
         saved |= {f"{of}_var": saved[name].square(), f"{of}count": torch.full_like(own[f"{of}count"], _EXPORTED_COUNT)}
     model.load_state_dict({**saved, **{name: value for name, value in own.items() if name.startswith("distribution.")}})
+
+
+def _rows_of(env: RobotTask, policy: Trained, groups: Sequence[str]) -> tuple[list[Row], list[Row]]:
+    """The rows that ``policy`` reads in ``env``, and those of the observation ``groups``."""
+    theirs = _observe(env, policy, "the policy to begin with").rows(TEACHER)
+    return theirs, [row for group in groups for row in env.observations.rows(group)]
+
+
+def _read_newest(path: Path, model: MLPModel, theirs: list[Row], ours: list[Row]) -> dict[str, Tensor]:
+    """The parameters at ``path`` as those of ``model``, whose rows ``ours`` have more frames than ``theirs``."""
+    newest, frames, read, start = [], [], 0, 0
+    for row, mine in zip(theirs, ours, strict=True):
+        start += mine.size
+        newest += range(start - row.size, start)
+        frames += [*range(read, read + row.size)] * (mine.history // row.history)
+        read += row.size
+    narrow, first = copy.deepcopy(model), model.mlp[0]
+    if not isinstance(first, torch.nn.Linear) or first.in_features != start:
+        raise ConfigError(f"{shown(path)} has one frame of each row; an actor with an encoder cannot begin with it")
+    narrow.mlp[0] = torch.nn.Linear(read, first.out_features, device=first.weight.device)
+    for name, value in narrow.obs_normalizer.named_buffers():
+        if value.dim() == 2:
+            setattr(narrow.obs_normalizer, name, value[:, newest])
+    saved, weight = read_actor(path, narrow), torch.zeros_like(first.weight)
+    weight[:, newest] = saved["mlp.0.weight"]
+    wide = {name: value[:, frames] for name, value in saved.items() if name.startswith("obs_n") and value.dim() == 2}
+    return saved | wide | {"mlp.0.weight": weight}
 
 
 def keep_teacher(teacher: Trained, run: Path) -> None:

@@ -315,7 +315,7 @@ def _begin(runner: Runner, start: Start) -> None:
         load_teacher(runner.alg.teacher, start.teacher, runner.env)
         runner.alg.teacher_loaded = True
     if start.policy:
-        begin_with(runner.alg.get_policy(), start.policy)
+        begin_with(runner.alg.get_policy(), start.policy, runner.env)
         if warmup := runner.cfg["critic_warmup"]:
             print(f"only the critic learns for {warmup} iterations (warm_start.critic_warmup)", flush=True)
 

@@ -23,6 +23,7 @@ class Ground:
 
     friction: float = 0.6  # sliding [-]
     condim: int = 3  # 1 frictionless, 3 sliding, 4 also torsional, 6 also rolling
+    contact_time: float = 0.0  # time constant (solref) [s]; 0: MuJoCo's 0.02
     terrain: Terrain | None = None  # None: the plane
     boxes: bool = False  # replace level pieces of the terrain by boxes, for MuJoCo's own engine
     slope: float = 0.0  # [deg] angle of gravity from -z towards x, as on a plane that slopes down along x
@@ -32,6 +33,8 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
     """Add the plane or the height field to ``spec``."""
     floor = spec.worldbody.add_geom(name=GROUND, contype=1, conaffinity=0, priority=1, condim=ground.condim)
     floor.friction = [ground.friction, 0.005, 0.0001]
+    if ground.contact_time:
+        floor.solref = [ground.contact_time, 1.0]
     if ground.terrain:
         rows, columns = ground.terrain.heights.shape
         spec.add_hfield(name=GROUND, nrow=rows, ncol=columns)
