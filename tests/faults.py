@@ -387,7 +387,7 @@ CASES: dict[str, Case] = {
     # the limits of the safety layer
     "angle beyond its range": Case("FL_hip_joint is at .* rad, .* beyond its range", "joint_bias=2"),
     "target beyond the range": Case(
-        "FL_calf_joint is told to go to 0.20 rad, 1.04 beyond its range", policy=puts(2, 0.2)
+        "FL_calf_joint is told to go to 0.20 rad, 1.04 beyond its range", policy=puts(2, 0.2), limits={"target": 1.0}
     ),
     "targets that jump": Case(
         "FL_thigh_joint is told to step by .* rad from one target to the next", policy=puts(1, 3.6)
