@@ -365,7 +365,7 @@ class BipedRoughCfgPPO(BipedCfgPPO):
 class LevelBipedRoughCfg(LevelBipedCfg):
     """A level biped of a G1's size on rough ground, trained from a policy of the flat: train.py --init g1_flat.
 
-    Numbers without a source: [ours: docs/archive/go2_and_g1.md, stairs with free knees].
+    Numbers without a source: [ours: docs/archive/go2_and_g1.md, free knees].
     """
 
     class observations(LevelBipedCfg.observations):
