@@ -65,7 +65,7 @@ class Limits:
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] largest torque of the motors
     position: float = 0.25  # [rad] measured angle beyond the range [0.20: simulated joint limits are soft]
-    target: float = 1.5  # [rad] target beyond the range [0.59; g1_rough 1.04, pushed]
+    target: float = 1.5  # [rad] target beyond the range [0.59; g1_rough 1.10, pushed]
     step: float = 2.5  # [rad] difference of two consecutive targets of a joint [1.91]
     torque: float = 2.0  # [share of `motor`] computed torque of a servo [1.46; go1_rough 2.10, pushed]
     speed: float = 60.0  # [rad/s] joint speed [55; go1_rough 59, pushed]
