@@ -361,7 +361,9 @@ def _read_newest(path: Path, model: MLPModel, theirs: list[Row], ours: list[Row]
         read += row.size
     narrow, first = copy.deepcopy(model), model.mlp[0]
     if not isinstance(first, torch.nn.Linear) or first.in_features != start:
-        raise ConfigError(f"{shown(path)} has one frame of each row; an actor with an encoder cannot begin with it")
+        raise ConfigError(
+            f"{shown(path)} has one frame of each row; this actor cannot begin with it; name a policy with its history"
+        )
     narrow.mlp[0] = torch.nn.Linear(read, first.out_features, device=first.weight.device)
     for name, value in narrow.obs_normalizer.named_buffers():
         if value.dim() == 2:
