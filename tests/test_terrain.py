@@ -132,6 +132,14 @@ def drop_rays(spec: mujoco.MjSpec, points: np.ndarray) -> list[float]:
     return [5.0 - mujoco.mj_ray(model, data, np.array([*p, 5.0]), down, None, 1, -1, hit) for p in points]
 
 
+def test_the_field_and_its_boxes_are_as_hard_as_asked() -> None:
+    ground, spec = terrain(levels=2), mujoco.MjSpec()
+    add_ground(spec, Ground(contact_time=0.01, terrain=ground), [])
+    replace_level_pieces(spec, ground, [])
+    model = spec.compile()
+    assert model.ngeom > 1 and (model.geom_solref[:, 0] == 0.01).all()
+
+
 @pytest.mark.parametrize("cell", [0.1, 0.05])
 def test_a_lookup_is_what_a_ray_hits(cell: float) -> None:
     ground, spec = terrain(levels=2, cell=cell), mujoco.MjSpec()

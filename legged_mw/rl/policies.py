@@ -6,7 +6,6 @@ import copy
 import shutil
 from collections.abc import Iterable, Sequence
 from inspect import getfile
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -316,9 +315,8 @@ def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
     A row may have more frames here than there, if it has one there.
     """
     theirs, ours = _rows_of(env, policy, task.train.obs_groups.actor)
-    frames = [row.history for row in theirs]
-    known = [row._replace(history=1) if one == 1 else row for row, one in zip_longest(ours, frames) if row]
-    if [*map(_layout, theirs)] != [*map(_layout, known)]:
+    same = [*map(_layout, theirs)] == [*map(_layout, ours)]
+    if not (same and all(row.history in (1, mine.history) for row, mine in zip(theirs, ours, strict=True))):
         raise ConfigError(
             f"{shown(policy.source.checkpoint)}: it reads {_in_words(theirs)}; "
             f"the actor of {task.name} reads {_in_words(ours)}"
@@ -399,8 +397,9 @@ def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
     raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(differences)}")
 
 
-def _layout(row: Row) -> tuple[str, int, int, list[float]]:
-    return row.name, row.value.shape[1], row.history, row.column_scales()
+def _layout(row: Row) -> tuple[str, int, list[float]]:
+    """What a frame of ``row`` means: its name, width and scales."""
+    return row.name, row.value.shape[1], row.column_scales()
 
 
 # ---- a policy of another task in this one: its observations, and differences in the meaning of its actions ----------
