@@ -276,7 +276,7 @@ def test_an_exported_actor_has_a_normalizer_that_has_seen_much(student: Path) ->
     assert got["obs_normalizer.count"] == 10**8 and not got["distribution.std_param"].any()
 
 
-def test_a_policy_of_one_frame_begins_one_with_a_history(tmp_path: Path) -> None:
+def test_a_policy_of_one_frame_begins_one_with_a_history(tmp_path: Path, device: str) -> None:
     """It acts as before, whatever the older frames are."""
     shipped = find_trained("go1_flat", tmp_path, "--init")
     narrow, wide = load_task("go1_flat"), load_task("go1_flat")
@@ -284,18 +284,18 @@ def test_a_policy_of_one_frame_begins_one_with_a_history(tmp_path: Path) -> None
         update_from_run(task, load_yaml(shipped.source.folder / "config.yaml"), where="config.yaml")
         task.set("env.num_envs", 4)
     wide.set("observations.history", {"state": 3, "state.dof_vel": 1})
-    before, after = (task.env_class(task.cfg, "cpu") for task in (narrow, wide))
+    before, after = (task.env_class(task.cfg, device) for task in (narrow, wide))
     check_start(after, wide, shipped)
     kind, options = resolve_class(acting(wide.train, after))
     model = kind(after.get_observations(), wide.train.to_dict()["obs_groups"], "actor", after.num_actions, **options)
-    begin_with(model, shipped, after)
+    begin_with(model.to(device), shipped, after)
     obs, seen, start, newest = after.get_observations(), before.get_observations(), 0, []
     obs["state"].normal_()
     for row in after.observations.rows("state"):
         start += row.size
         newest.append(obs["state"][:, start - row.value.shape[1] : start])
     seen["state"] = torch.cat(newest, dim=1)
-    policy = load_policy(shipped.source.checkpoint, before, narrow.train, "cpu")
+    policy = load_policy(shipped.source.checkpoint, before, narrow.train, device)
     torch.testing.assert_close(model(obs), policy(seen), rtol=1e-4, atol=1e-5)
 
 

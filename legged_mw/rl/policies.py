@@ -367,7 +367,7 @@ def _read_newest(path: Path, model: MLPModel, theirs: list[Row], ours: list[Row]
         if value.dim() == 2:
             setattr(narrow.obs_normalizer, name, value[:, newest])
     saved, weight = read_actor(path, narrow), torch.zeros_like(first.weight)
-    weight[:, newest] = saved["mlp.0.weight"]
+    weight[:, newest] = saved["mlp.0.weight"].to(weight)  # an export is read onto the CPU
     wide = {name: value[:, frames] for name, value in saved.items() if name.startswith("obs_n") and value.dim() == 2}
     return saved | wide | {"mlp.0.weight": weight}
 
