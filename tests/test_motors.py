@@ -193,6 +193,15 @@ def test_check_tells_what_a_delay_is_rounded_to() -> None:
     assert said in describe(env, load_task("go1_flat"))
 
 
+def test_check_tells_the_reach_of_each_action() -> None:
+    reach = {"normalization.clip_actions": 2.0, "control.action_scale": {"": 0.5, "calf": 0.25}}
+    for law, unit in (("servo", "rad"), ("torque", "N m")):
+        lines = describe(make_env(2, {**reach, "control.actuator": law}), load_task("go1_flat")).splitlines()
+        start = next(n for n, line in enumerate(lines) if line.startswith("joints:"))
+        assert lines[start].endswith(f"[{unit}]")
+        assert [line.split()[-1] for line in lines[start + 1 : start + 4]] == ["+-1", "+-1", "+-0.5"]
+
+
 # ---- torques and a law in code
 
 

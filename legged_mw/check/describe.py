@@ -39,12 +39,7 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
     lines += [f"  {name:<20} {scales[name]:g}" for name in env.reward_names]
     off = [name for name in _own_terms(env) if not scales.get(name)]
     lines += [f"  {name:<20} off: rewards.scales.{name} is {scales.get(name, 'missing')}" for name in off]
-    lines.append("joints: default, range [rad], force limit [N m]")
-    width = max(map(len, env.robot.joint_names))
-    for name, default, (low, high), (_, limit) in zip(
-        env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
-    ):
-        lines.append(f"  {name:<{width}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
+    lines += _joints(env)
     lines += [_motors(env), _randomized(env), _room(env)]
     lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
@@ -64,6 +59,23 @@ def _memories(task: LoadedTask) -> list[str]:
         f"the {name} remembers: {part.rnn_type}, {part.rnn_hidden_dim} units, layers: {part.rnn_num_layers}"
         for name, part in networks.items()
         if part.class_name.endswith("RNNModel")
+    ]
+
+
+def _joints(env: RobotTask) -> list[str]:
+    """A line for each joint, with the most that its action can ask of the motor."""
+    control, names = env.cfg.control, env.robot.joint_names
+    unit = "N m" if env.actuators.law == "torque" else "rad/s" if control.action_origin == "speed" else "rad"
+    reach = (env.cfg.normalization.clip_actions * env.actuators.scale).tolist()
+    table = zip(
+        *(names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, reach), strict=True
+    )
+    return [
+        f"joints: default, range [rad], force limit [N m], its action's reach, clip_actions times action_scale [{unit}]",
+        *(
+            f"  {name:<{max(map(len, names))}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}  +-{most:.3g}"
+            for name, default, (low, high), (_, limit), most in table
+        ),
     ]
 
 
