@@ -131,7 +131,7 @@ def test_check(tmp_path: Path) -> None:
         "122 kick_active 1",
         "actions (12), clipped at +-2, 50 Hz",
         "lin_vel_z -0.7",
-        "FR_calf_joint -1.800 [-2.818, -0.888] 35.55",
+        "FR_calf_joint -1.800 [-2.818, -0.888] 35.55 +-1",
         "RL_calf_joint servo: kp 20 N m/rad",
     ):
         assert line in lines
