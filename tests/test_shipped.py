@@ -58,10 +58,20 @@ def test_the_files_of_its_further_trainings_give_its_config(folder: Path) -> Non
     ours, theirs = task.train.to_dict(), ran.train.to_dict()
     lengths = ("max_iterations", "save_interval", "keep_checkpoints", "exam_interval", "experiment_name")
     for config in (ours, theirs):
-        config["warm_start"].pop("policy"), config.pop("seed")
+        config.pop("seed")
+        config["warm_start"].pop("policy")
         for name in lengths:
             config["runner"].pop(name)
     assert ours == theirs
+
+
+@pytest.mark.parametrize(
+    "file",
+    [file for folder in POLICIES for file in folder.glob("*.yaml") if file.name not in ("config.yaml", "policy.yaml")],
+    ids=lambda file: f"{file.parent.name}/{file.name}",
+)
+def test_each_file_of_overrides_fits_its_task(file: Path) -> None:
+    load_task(file.parent.name).update(load_yaml(file), where=file.name)
 
 
 @pytest.mark.parametrize(

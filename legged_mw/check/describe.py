@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from legged_mw.check.own_class import own_classes
 from legged_mw.envs.domain_rand import active
-from legged_mw.envs.motors import round_delay
+from legged_mw.envs.motors import OWN, round_delay
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.students.estimator import find_targets
 from legged_mw.sim.capacity import count_capacity
@@ -64,8 +64,9 @@ def _memories(task: LoadedTask) -> list[str]:
 
 def _joints(env: RobotTask) -> list[str]:
     """A line for each joint, with the most that its action can ask of the motor."""
-    control, names = env.cfg.control, env.robot.joint_names
-    unit = "N m" if env.actuators.law == "torque" else "rad/s" if control.action_origin == "speed" else "rad"
+    names, law = env.robot.joint_names, env.actuators.law
+    by_angle = "rad/s" if env.cfg.control.action_origin == "speed" else "rad"
+    unit, width = {"torque": "N m", OWN: "as its law takes it"}.get(law, by_angle), max(map(len, names))
     reach = (env.cfg.normalization.clip_actions * env.actuators.scale).tolist()
     table = zip(
         *(names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, reach), strict=True
@@ -73,7 +74,7 @@ def _joints(env: RobotTask) -> list[str]:
     return [
         f"joints: default, range [rad], force limit [N m], its action's reach, clip_actions times action_scale [{unit}]",
         *(
-            f"  {name:<{max(map(len, names))}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}  +-{most:.3g}"
+            f"  {name:<{width}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}  +-{most:.3g}"
             for name, default, (low, high), (_, limit), most in table
         ),
     ]

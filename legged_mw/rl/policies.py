@@ -219,18 +219,18 @@ def act(policy: MLPModel, obs: TensorDict) -> Tensor:
 
 
 def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
-    """Name -> parameter of ``policy`` in the export at ``path``, bit for bit.
+    """Name -> parameter of ``policy`` in the export at ``path``, bit for bit, on its device.
 
     Exploration noise and the normaliser's count and variance are not in the file, so they come from ``policy``.
     """
     import onnx
     from onnx import numpy_helper
 
+    device = next(policy.parameters()).device
     try:
         graph = onnx.load(path, load_external_data=False).graph
-        stored = {
-            each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer
-        }
+        arrays = {each.name: numpy_helper.to_array(each).astype(np.float32) for each in graph.initializer}
+        stored = {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}
     except FileNotFoundError:
         raise ConfigError(f"no policy at {path}") from None
     except Exception:  # errors of protobuf and onnx
@@ -367,7 +367,7 @@ def _read_newest(path: Path, model: MLPModel, theirs: list[Row], ours: list[Row]
         if value.dim() == 2:
             setattr(narrow.obs_normalizer, name, value[:, newest])
     saved, weight = read_actor(path, narrow), torch.zeros_like(first.weight)
-    weight[:, newest] = saved["mlp.0.weight"].to(weight)  # an export is read onto the CPU
+    weight[:, newest] = saved["mlp.0.weight"]
     wide = {name: value[:, frames] for name, value in saved.items() if name.startswith("obs_n") and value.dim() == 2}
     return saved | wide | {"mlp.0.weight": weight}
 
