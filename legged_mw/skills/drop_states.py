@@ -15,7 +15,12 @@ from legged_mw.utils.machine import usable_cores
 
 DAMPING = (0.0, 5.0)  # [N m s/rad] least joint damping: half of the states limp, half braked
 VELOCITY = 0.5  # [m/s, rad/s] root velocity at the drop: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
+DEPTH = (
+    0.01  # [m] parts that overlap by more at the drop would be pushed through one another: joints are redrawn [ours]
+)
+_TRIES = 100  # draws of a state's joints; the last one stays
 CLEAR = 0.02  # [m] between the lowest point and the ground at the drop
+_HIGH = 100.0  # [m] where joints are drawn, away from the ground
 _CHUNK = 256  # worlds stepped together; it limits the memory
 
 
@@ -47,17 +52,21 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
 def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Random attitudes, and joint angles within the ranges (+-pi without a range), just above the ground."""
     data, joints = mujoco.MjData(model), slice(1, model.njnt)
-    draw = rng.random((count, 9 + model.nq - 7))  # all at once, so that a state does not depend on ``count``
+    draw = rng.random((count, 9))  # all at once, so that a state does not depend on ``count``
+    seeds = rng.spawn(count)
     # [Shoemake 1992: uniform attitudes]
     size, turn = np.sqrt([1.0 - draw[:, 6], draw[:, 6]]), 2.0 * np.pi * draw[:, 7:9].T
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-np.pi, np.pi]).T
     qpos, qvel = np.zeros((count, model.nq)), np.zeros((count, model.nv))
+    qpos[:, 2], qvel[:, :6] = _HIGH, VELOCITY * (2.0 * draw[:, :6] - 1.0)
     qpos[:, 3:7] = np.concatenate([size * np.sin(turn), size * np.cos(turn)]).T
-    qpos[:, 7:] = low + (high - low) * draw[:, 9:]
-    qvel[:, :6] = VELOCITY * (2.0 * draw[:, :6] - 1.0)
     touching = (model.geom_bodyid > 0) & (model.geom_conaffinity > 0)
-    for state in qpos:
-        data.qpos = state
-        mujoco.mj_kinematics(model, data)
-        state[2] = CLEAR - (data.geom_xpos[touching, 2] - model.geom_rbound[touching]).min()
+    for state, own in zip(qpos, seeds, strict=True):
+        for _ in range(_TRIES):
+            state[7:] = own.uniform(low, high)
+            data.qpos = state
+            mujoco.mj_fwdPosition(model, data)  # in the air: it touches itself alone
+            if data.contact.dist[: data.ncon].min(initial=0.0) > -DEPTH:
+                break
+        state[2] += CLEAR - (data.geom_xpos[touching, 2] - model.geom_rbound[touching]).min()
     return qpos, qvel
