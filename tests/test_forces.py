@@ -25,7 +25,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.export.exporter import export
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
-from legged_mw.sim.sensors import ANGULAR_MOMENTUM, CONTACT_FORCE, SELF_CONTACT
+from legged_mw.sim.sensors import ANGULAR_MOMENTUM, COM_VELOCITY, CONTACT_FORCE, SELF_CONTACT
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
@@ -99,7 +99,7 @@ def one_by_one(model: mujoco.MjModel, data: mujoco.MjData, geom: str) -> np.ndar
 @pytest.mark.parametrize("cone", ["PYRAMIDAL", "ELLIPTIC"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_forces_are_those_of_mj_contact_force(engine: str, cone: str) -> None:
-    robot = go1([CONTACT_FORCE, ANGULAR_MOMENTUM])
+    robot = go1([CONTACT_FORCE, ANGULAR_MOMENTUM, COM_VELOCITY])
     model = robot.physics
     model.opt.cone = getattr(mujoco.mjtCone, f"mjCONE_{cone}")
     sim = make_simulation(model, 2, "cpu", engine=engine)
@@ -111,6 +111,7 @@ def test_forces_are_those_of_mj_contact_force(engine: str, cone: str) -> None:
     sim.step()
     got = -sim.sensordata[:, robot.sensors[CONTACT_FORCE]].unflatten(1, (4, 4))[..., 1:]
     momentum = sim.sensordata[:, robot.sensors[ANGULAR_MOMENTUM]]
+    com = sim.sensordata[:, robot.sensors[COM_VELOCITY]]
     for world in range(2):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:], data.ctrl[:] = before[0][world], before[1][world], HOME
@@ -120,6 +121,7 @@ def test_forces_are_those_of_mj_contact_force(engine: str, cone: str) -> None:
         assert (want[:, 2] > 10.0).all() and np.abs(want[:, 0]).max() > 5.0
         np.testing.assert_allclose(got[world], want, atol=0.02)  # of some 50 N
         np.testing.assert_allclose(momentum[world], data.subtree_angmom[1], atol=1e-4)
+        np.testing.assert_allclose(com[world], data.subtree_linvel[1], atol=1e-4)
         assert sim.sensordata[world, robot.sensors["contact"]].tolist() == [1.0] * 4
 
 
@@ -200,7 +202,7 @@ def test_a_sensor_of_the_file_is_kept_where_it_is_asked_for(engine: str, tmp_pat
         make_env(1, {**more, "asset.sense": ["shank"]})
 
 
-@pytest.mark.parametrize("name", ["contact_forces", "self_contacts", "angular_momentum"])
+@pytest.mark.parametrize("name", ["contact_forces", "self_contacts", "angular_momentum", "com_velocity"])
 def test_what_is_asked_for_is_sensed(name: str) -> None:
     """tests/golden/tasks.py has what is said where it is not."""
 

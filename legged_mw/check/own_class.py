@@ -23,7 +23,7 @@ PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )
-COSTS = ("power", "shock")  # of skills; a skill's other terms pay
+COSTS = ("power", "shock", "stand_torques")  # of skills; a skill's other terms pay
 # Methods of a class ported from legged_gym that nothing here calls -> method that is called. docs/from_legged_gym.md
 LEGGED_GYM_METHODS: dict[str, str] = {
     "post_physics_step": "_step()",

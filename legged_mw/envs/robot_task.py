@@ -37,7 +37,7 @@ from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.joints import PARTIAL, posed, some_joints
 from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, standing_height
-from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT, SENSORS
+from legged_mw.sim.sensors import ANGULAR_MOMENTUM, COM_VELOCITY, SELF_CONTACT, SENSORS
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
@@ -583,6 +583,11 @@ class RobotTask(BaseTask):
     def angular_momentum(self) -> Tensor:
         """(N, 3) Angular momentum of the whole robot about its centre of mass, world frame [kg m^2/s]."""
         return self.sensor(ANGULAR_MOMENTUM)
+
+    @property
+    def com_velocity(self) -> Tensor:
+        """(N, 3) Velocity of the whole robot's centre of mass, world frame [m/s]."""
+        return self.sensor(COM_VELOCITY)
 
     def _init_robot_rewards(self) -> None:
         """Make the buffers that only active reward terms need. Raises ConfigError if a term lacks something."""

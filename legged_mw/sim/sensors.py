@@ -13,13 +13,14 @@ from legged_mw.utils.errors import ModelError, unknown
 
 SELF_CONTACT = "self_contacts"  # number of contacts of the robot with itself
 ANGULAR_MOMENTUM = "angular_momentum"  # of the whole robot about its centre of mass, world frame [kg m^2/s]
+COM_VELOCITY = "com_velocity"  # of the whole robot's centre of mass, world frame [m/s]
 CONTACT_FORCE = "contact_forces"  # net force of each contact geom on the ground, world frame [N]
 _SENS, _OBJ = mujoco.mjtSensor, mujoco.mjtObj
 _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}")) for name in ("FOUND", "FORCE"))
 _NET = 3  # reduction of the contact sensor: net force of all contacts, world frame
 _IMU = "imu"  # default name of the IMU site
 _ALIGNED = 1e-4  # [rad] axes that differ by less are parallel
-SENSORS = (SELF_CONTACT, ANGULAR_MOMENTUM, CONTACT_FORCE)  # on demand
+SENSORS = (SELF_CONTACT, ANGULAR_MOMENTUM, COM_VELOCITY, CONTACT_FORCE)  # on demand
 
 
 def add_sensors(spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str) -> None:
@@ -40,9 +41,11 @@ def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str
         tree = _OBJ.mjOBJ_XBODY
         itself = {"objtype": tree, "objname": root, "reftype": tree, "refname": root, "intprm": [_FOUND, 0, 1]}
         spec.add_sensor(name=SELF_CONTACT, type=_SENS.mjSENS_CONTACT, **itself)
+    whole = {"objtype": _OBJ.mjOBJ_BODY, "objname": root}
     if ANGULAR_MOMENTUM in more:
-        body = {"objtype": _OBJ.mjOBJ_BODY, "objname": root}
-        spec.add_sensor(name=ANGULAR_MOMENTUM, type=_SENS.mjSENS_SUBTREEANGMOM, **body)
+        spec.add_sensor(name=ANGULAR_MOMENTUM, type=_SENS.mjSENS_SUBTREEANGMOM, **whole)
+    if COM_VELOCITY in more:
+        spec.add_sensor(name=COM_VELOCITY, type=_SENS.mjSENS_SUBTREELINVEL, **whole)
     if CONTACT_FORCE in more:  # the sensors "contact/..." also measure the force, so that contacts are searched once
         for name in contact_geoms:
             spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]

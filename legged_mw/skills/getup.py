@@ -5,13 +5,15 @@ Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobot
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.sensors import COM_VELOCITY
 from legged_mw.sim.simulation import Simulation
 from legged_mw.skills.drop_states import fallen
 from legged_mw.skills.skill_config import SkillCfg, SkillCfgPPO
@@ -64,7 +66,7 @@ class GetupCfg(SkillCfg):
     class rewards(SkillCfg.rewards):
         only_positive_rewards = False  # [ours, P True: no fall ends an episode, and thrashing would cost nothing]
         soft_power: Positive = 700.0  # of all joints together, of `power` [W] [ours: of a G1, with bursts of 3.2 kW]
-        soft_acceleration: Positive = 1.5  # of the IMU, of `shock`, in multiples of 9.81 m/s^2 [-] [ours: 1 at rest]
+        soft_acceleration: Positive = 1.5  # of `shock`: ground force, as a share of the weight [-] [ours: 1 at rest]
 
         class scales(SkillCfg.rewards.scales):  # [P], with our terms of the same meaning
             upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
@@ -115,6 +117,8 @@ class LiftAssist:
 class Getup(RobotTask):
     cfg: GetupCfg
     exam = "getup"
+    SENSED_FOR: ClassVar[Mapping[str, str]] = {**RobotTask.SENSED_FOR, "shock": COM_VELOCITY}
+    last_com_velocity: Tensor  # (N, 3) of the previous step; only with `shock`
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
@@ -125,6 +129,7 @@ class Getup(RobotTask):
         self.up_height = 0.99 * self.start_place[2]  # [m] height of a standing root [P: 0.275 of 0.278]
         self.upright = self.buffer()  # (N,) cosine of the tilt
         self.up = self.buffer(dtype=torch.bool)  # (N,) true if the robot is as high and upright as a standing one
+        self.highest_torque = self._tensor(self.robot.effort_range[:, 1])  # (D,) [N m], infinite without a limit
         force = falls.pull * 9.81 * self.total_mass
         self.pull = self.remember(LiftAssist(self.sim, self._lifted(), self.gravity_dir, force, falls.pull_fades))
 
@@ -139,6 +144,9 @@ class Getup(RobotTask):
             mend = "name another body in falls.pull_on"
             raise ConfigError(f"falls.pull lifts the root, which perturbation.kick pushes: {mend}")
         return lifted
+
+    def _episode_columns(self) -> dict[str, int]:
+        return super()._episode_columns() | ({"last_com_velocity": 3} if "shock" in self._active_scales() else {})
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Start in the default pose, or with probability ``falls.share`` in a state after a fall.
@@ -160,6 +168,11 @@ class Getup(RobotTask):
     def _apply_actions(self) -> None:
         super()._apply_actions()
         self.pull.apply()
+
+    def _end_step(self) -> None:
+        super()._end_step()
+        if "shock" in self.reward_names:
+            self.last_com_velocity.copy_(self.com_velocity)
 
     def _update_curricula(self, mask: Tensor) -> None:
         super()._update_curricula(mask)
@@ -187,6 +200,10 @@ class Getup(RobotTask):
     def _near_upright(self) -> Tensor:
         return torch.exp(-4.0 * (1.0 - self.upright))  # exp(-2 |g + z|^2) of unit vectors [P]
 
+    def _standing(self) -> Tensor:
+        """1 for an upright robot of standing height, 0 below 0.6 of it."""
+        return self._near_upright() * ((self.base_height / self.up_height - 0.6) / 0.3).clamp(0.0, 1.0)
+
     def _reward_upright(self) -> Tensor:
         """How upright it is. [P: the second half alone, 0 once it lies; ours: a half that is linear in the tilt]"""
         return 0.5 - torch.acos(self.upright.clamp(-1.0, 1.0)) / (2.0 * torch.pi) + 0.5 * self._near_upright()
@@ -201,8 +218,7 @@ class Getup(RobotTask):
 
     def _reward_stand_still(self) -> Tensor:
         """Joints at rest, while it is up. [P: small actions, all or nothing; ours: as the exam]"""
-        high = ((self.base_height / self.up_height - 0.6) / 0.3).clamp(0.0, 1.0)
-        return self._near_upright() * high * torch.exp(-0.5 * self.dof_vel.square().mean(dim=1))
+        return self._standing() * torch.exp(-0.5 * self.dof_vel.square().mean(dim=1))
 
     def _reward_power(self) -> Tensor:
         """Square of the sum of |joint velocity * torque| beyond ``rewards.soft_power``, as a share of it [-]. [ours]
@@ -212,9 +228,13 @@ class Getup(RobotTask):
         return (self._reward_energy() / self.cfg.rewards.soft_power - 1.0).clamp(0.0, 8.0).square()
 
     def _reward_shock(self) -> Tensor:
-        """Square of the IMU's proper acceleration beyond ``rewards.soft_acceleration``, both in g [-]. [ours]
+        """Square of the ground force beyond ``rewards.soft_acceleration``, in body weights [-]. At most 64. [ours]
 
-        At most 64. It is what the last simulation step of a control step had: blows in between are missed.
+        The mean of a control step (20 ms), from the velocity of the centre of mass, so that no blow is missed.
         """
-        acceleration = self.accelerometer.norm(dim=1) / 9.81
-        return (acceleration - self.cfg.rewards.soft_acceleration).clamp(0.0, 8.0).square()
+        change = (self.com_velocity - self.last_com_velocity) / self.dt - 9.81 * self.gravity_dir
+        return (change.norm(dim=1) / 9.81 - self.cfg.rewards.soft_acceleration).clamp(0.0, 8.0).square()
+
+    def _reward_stand_torques(self) -> Tensor:
+        """Mean square of the torques as shares of their limits, while it is up. [ours]"""
+        return self._standing() * (self.torques / self.highest_torque).square().mean(dim=1)
