@@ -41,33 +41,34 @@ class G1(RobotTaskCfg):
         dt, iterations, ls_iterations = 0.005, 3, 10  # [s] [M], [ours: soles slip with 1; docs/lab.md]
 
 
-class WalkingG1(G1, LeggedRobotCfg):
+class UprightG1(G1, LeggedRobotCfg):
     class asset(G1.asset, LeggedRobotCfg.asset):
         foot_names = ["left_foot", "right_foot"]
         foot_geoms = {"left_foot": ["left_foot[26]_collision"], "right_foot": ["right_foot[26]_collision"]}
         colliders = ["*_foot[26]_collision"]  # the outer two of a sole's seven capsules [ours]
 
+    class control(G1.control, LeggedRobotCfg.control):  # legs [U], waist [UL]; beside [M]'s: docs/archive/go2_and_g1.md
+        stiffness = {**G1.control.stiffness, "hip": 100.0, "hip_roll": 100.0, "knee": 150.0, "ankle": 40.0,
+                     "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]  # fmt: skip
+        damping = {**G1.control.damping, "hip": 2.0, "hip_roll": 2.0, "knee": 4.0, "ankle": 2.0,
+                   "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]  # fmt: skip
+        action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [ours]
+
     class rewards(LeggedRobotCfg.rewards):
-        pose_weights = {"": 0.3, "hip_pitch": 0.02, "knee": 0.02, "ankle": 0.05, "hip_roll": 0.5, "hip_yaw": 0.5,
-                        "waist": 1.0}  # [ours]  # fmt: skip
+        min_feet_distance = 0.2  # [m]
+        pose_weights = {"": 3.4, "hip_pitch": 0.14, "knee": 0.14, "hip_roll": 1.5, "hip_yaw": 1.5,  # [M]
+                        "ankle_pitch": 1.5, "waist_yaw": 1.5, "shoulder_pitch": 1.5}  # fmt: skip
+        deviation_weights = {"": 0.0, "waist": 1.0, "waist_yaw": 0.2, "hip_roll": 0.2, "hip_yaw": 0.2}  # [ours]
 
     class exam(LeggedRobotCfg.exam):
         peer = "g1"
 
 
-class UprightG1(WalkingG1):
-    class control(WalkingG1.control):  # legs [U], waist [UL]; beside [M]'s: docs/archive/go2_and_g1.md
-        stiffness = {**WalkingG1.control.stiffness, "hip": 100.0, "hip_roll": 100.0, "knee": 150.0, "ankle": 40.0,
-                     "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]  # fmt: skip
-        damping = {**WalkingG1.control.damping, "hip": 2.0, "hip_roll": 2.0, "knee": 4.0, "ankle": 2.0,
-                   "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]  # fmt: skip
-        action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [ours]
-
-    class rewards(WalkingG1.rewards):
-        min_feet_distance = 0.2  # [m]
-        pose_weights = {"": 3.4, "hip_pitch": 0.14, "knee": 0.14, "hip_roll": 1.5, "hip_yaw": 1.5,  # [M]
-                        "ankle_pitch": 1.5, "waist_yaw": 1.5, "shoulder_pitch": 1.5}  # fmt: skip
-        deviation_weights = {"": 0.0, "waist": 1.0, "waist_yaw": 0.2, "hip_roll": 0.2, "hip_yaw": 0.2}  # [ours]
+class FirmWaistG1(G1):
+    class control(G1.control):  # [UL: with [M]'s 28.5 the torso, which topples with 22 N m/rad, leans on the end stop]
+        stiffness = {**G1.control.stiffness, "waist": 200.0}  # [N m/rad]
+        damping = {**G1.control.damping, "waist": 5.0}  # [N m s/rad]
+        action_scale = {**SCALE, "waist": 0.1}
 
 
 class TrackedG1(G1, MotionTrackingCfg):
@@ -75,11 +76,9 @@ class TrackedG1(G1, MotionTrackingCfg):
         colliders = ["*_foot?_collision"]  # all seven capsules of a sole [ours: it stands on one foot]
 
     class motion(MotionTrackingCfg.motion):  # [B]
-        bodies = [
-            *["pelvis", "left_hip_roll_link", "left_knee_link", "left_ankle_roll_link"],
-            *["right_hip_roll_link", "right_knee_link", "right_ankle_roll_link"],
-            *["torso_link", "left_shoulder_roll_link", "left_elbow_link", "left_wrist_yaw_link"],
-            *["right_shoulder_roll_link", "right_elbow_link", "right_wrist_yaw_link"],
-        ]
+        bodies = ["pelvis", "left_hip_roll_link", "left_knee_link", "left_ankle_roll_link",
+                  "right_hip_roll_link", "right_knee_link", "right_ankle_roll_link",
+                  "torso_link", "left_shoulder_roll_link", "left_elbow_link", "left_wrist_yaw_link",
+                  "right_shoulder_roll_link", "right_elbow_link", "right_wrist_yaw_link"]  # fmt: skip
         anchor = "torso_link"
         end_bodies = ["left_ankle_roll_link", "right_ankle_roll_link", "left_wrist_yaw_link", "right_wrist_yaw_link"]

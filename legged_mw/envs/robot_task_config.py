@@ -73,8 +73,8 @@ class RobotTaskCfg(Config):
         self_collisions: bool = False  # among the colliders
         penalize_contacts_on: list[str] = []  # as colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # as colliders: ground contact of one of them is a fall [L]
-        # values to sense for your code, read by `env.sensor(name)`: contact_forces, self_contacts, angular_momentum, or
-        # a sensor of the file by name; active reward terms add theirs
+        # values to sense for your code, read by `env.sensor(name)`: contact_forces, self_contacts, angular_momentum,
+        # com_velocity, or a sensor of the file by name; active reward terms add theirs
         sense: list[str] = []
         held_joints: list[str] = []  # names or patterns of joints that are welded at their default angle
         # tables a joint; joints without a key keep the file's
