@@ -15,9 +15,7 @@ from legged_mw.utils.machine import usable_cores
 
 DAMPING = (0.0, 5.0)  # [N m s/rad] least joint damping: half of the states limp, half braked
 VELOCITY = 0.5  # [m/s, rad/s] root velocity at the drop: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
-DEPTH = (
-    0.01  # [m] parts that overlap by more at the drop would be pushed through one another: joints are redrawn [ours]
-)
+DEPTH = 0.01  # [m] joints are redrawn where parts overlap by more, since one would be pushed through the other [ours]
 _TRIES = 100  # draws of a state's joints; the last one stays
 CLEAR = 0.02  # [m] between the lowest point and the ground at the drop
 _HIGH = 100.0  # [m] where joints are drawn, away from the ground
