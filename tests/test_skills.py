@@ -368,6 +368,22 @@ def check_switch(rescuer: Path) -> None:
         SwitchStage(POLICIES / "go1_flat", POLICIES / "go1_rough_scan")
 
 
+def test_a_g1_that_is_pushed_over_gets_up_and_walks_on() -> None:
+    """Its two policies have different gains; each robot has those of the policy that runs."""
+    stage = SwitchStage(POLICIES / "g1_flat", POLICIES / "g1_getup", 2, command=(0.5, 0.0, 0.0))
+    fell = False
+    for step in range(round(6.0 / stage.dt)):
+        if step == 50:
+            stage.push(1, np.array([0.0, 8.0]))
+        stage.step()
+        if stage.rescued[1] and not fell:
+            fell = True
+            stage.step()
+            gains = stage.fleet._batch.expand("actuator_gainprm")[:, stage.fleet._actuators, 0]
+            np.testing.assert_allclose(gains, [stage.contract.stiffness, stage.rescuer.contract.stiffness])
+    assert fell and not stage.rescued.any() and (stage.velocity()[:, 0] > 0.3).all()
+
+
 @pytest.mark.parametrize(
     ("args", "line"),
     [

@@ -186,7 +186,7 @@ HOLD = 0.5  # [s]
 class SwitchStage(DeployStage):
     """Robots with the policy in ``first``. After a fall the policy in ``second`` runs until the robot stands.
 
-    A fall resets no robot; a robot that MuJoCo cannot step is reset.
+    A fall resets no robot; a robot that MuJoCo cannot step is reset. Servos have the gains of the policy that runs.
     """
 
     def __init__(
@@ -198,6 +198,9 @@ class SwitchStage(DeployStage):
         other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
+        # stiffness and damping (D,), of the second and the first policy
+        pairs = ((other.stiffness, self.contract.stiffness), (other.damping, self.contract.damping))
+        self._gains = [] if all(np.array_equal(*pair) for pair in pairs) else pairs
         self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) True while the second policy runs
         self._standing = np.zeros(num_worlds, dtype=int)  # (N,) control periods since the robot stands
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
@@ -206,6 +209,8 @@ class SwitchStage(DeployStage):
         self._take(commands)
         self._seen, rescued = self.measured, self.rescued[:, None]
         targets = self.controller.act(self._seen, self._commands), self.rescuer.act(self._seen, self._none)
+        if self._gains:
+            self.fleet.set_gains(*(np.where(rescued, *pair) for pair in self._gains))
         self.fleet.write(np.where(rescued, targets[1], targets[0]))
         self.measured = self.fleet.read()
         broken = self.fleet.broken | ~np.isfinite(self.fleet.qvel).all(axis=1)
@@ -238,12 +243,12 @@ class SwitchStage(DeployStage):
 def check_same(first: Contract, second: Contract) -> None:
     """Raise UserError if two policies cannot control the same robot."""
     unshared = sorted({row.name for row in second.rows if row.measured in OWN} - {row.name for row in first.rows})
+    gains = [[each.stiffness.tolist(), each.damping.tolist()] for each in (first, second)]
     for name, value, other_value in (
         ("joints", first.joints, second.joints),
         ("period", first.period, second.period),
-        ("stiffness", first.stiffness.tolist(), second.stiffness.tolist()),
-        ("damping", first.damping.tolist(), second.damping.tolist()),
         ("motors", first.motors, second.motors),
+        *([] if first.motors.law == "servo" else [("gains", *gains)]),
         ("rows with sensors of their own", [], unshared),
     ):
         if value != other_value:

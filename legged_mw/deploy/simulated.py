@@ -209,7 +209,7 @@ class Fleet:
             self._network.reset(which)
 
     def set_gains(self, stiffness: Floats, damping: Floats) -> None:
-        """Set the servo gains of every robot: (D,) [N m/rad] and (D,) [N m s/rad], in the contract's order.
+        """Set the servo gains: (D,) or (N, D) [N m/rad] and [N m s/rad], in the contract's order.
 
         Damping is clipped to half of inertia / timestep, because more is unstable at this time step.
         Real drives use a shorter time step.
