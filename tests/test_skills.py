@@ -21,6 +21,7 @@ from legged_mw.deploy.simulated import Fleet
 from legged_mw.eval import perform, skills
 from legged_mw.eval.perform import machine, on_ground
 from legged_mw.eval.skills import ExamGround, ExamRobot, Recording
+from legged_mw.sim.model import RobotModel
 from legged_mw.skills.drop_states import fallen
 from legged_mw.skills.getup import Getup
 from legged_mw.skills.handstand import Handstand
@@ -170,6 +171,17 @@ def test_torques_cost_only_while_it_is_up(go1: Getup) -> None:
     go1._refresh_base()
     cost = go1._reward_stand_torques()
     assert cost[0] == pytest.approx(0.25 / 12) and cost[1] == 0.0 and cost[2] < 1e-4
+
+
+def test_a_cost_of_torques_needs_a_force_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without one a share of it would be 0, and the term silent."""
+    free = np.full((12, 2), np.inf) * [-1.0, 1.0]
+    monkeypatch.setattr(RobotModel, "effort_range", property(lambda self: free))
+    env = make("go1_getup", falls__states=4)
+    with pytest.raises(ConfigError, match="rewards.scales.stand_torques is on, but no joint has a force limit"):
+        env._reward_stand_torques()
+    with pytest.raises(ConfigError, match="rewards.scales.torque_limits is on, but no joint has a force limit"):
+        make("go1_getup", falls__states=4, rewards__scales__torque_limits=-1.0)
 
 
 def test_pull_lifts_and_fades() -> None:

@@ -41,17 +41,24 @@ class G1(RobotTaskCfg):
         dt, iterations, ls_iterations = 0.005, 3, 10  # [s] [M], [ours: soles slip with 1; docs/lab.md]
 
 
-class UprightG1(G1, LeggedRobotCfg):
+class FirmWaistG1(G1):
+    class control(G1.control):  # [UL: with [M]'s 28.5 the torso, which topples with 22 N m/rad, leans on the end stop]
+        stiffness = {**G1.control.stiffness, "waist": 200.0}  # [N m/rad]
+        damping = {**G1.control.damping, "waist": 5.0}  # [N m s/rad]
+        action_scale = {**SCALE, "waist": 0.1}
+
+
+class UprightG1(FirmWaistG1, LeggedRobotCfg):
     class asset(G1.asset, LeggedRobotCfg.asset):
         foot_names = ["left_foot", "right_foot"]
         foot_geoms = {"left_foot": ["left_foot[26]_collision"], "right_foot": ["right_foot[26]_collision"]}
         colliders = ["*_foot[26]_collision"]  # the outer two of a sole's seven capsules [ours]
 
-    class control(G1.control, LeggedRobotCfg.control):  # legs [U], waist [UL]; beside [M]'s: docs/archive/go2_and_g1.md
-        stiffness = {**G1.control.stiffness, "hip": 100.0, "hip_roll": 100.0, "knee": 150.0, "ankle": 40.0,
-                     "waist": 200.0, "waist_yaw": 200.0}  # [N m/rad]  # fmt: skip
-        damping = {**G1.control.damping, "hip": 2.0, "hip_roll": 2.0, "knee": 4.0, "ankle": 2.0,
-                   "waist": 5.0, "waist_yaw": 5.0}  # [N m s/rad]  # fmt: skip
+    class control(FirmWaistG1.control, LeggedRobotCfg.control):  # legs [U]; beside [M]'s: docs/archive/go2_and_g1.md
+        stiffness = {**FirmWaistG1.control.stiffness, "hip": 100.0, "hip_roll": 100.0, "knee": 150.0, "ankle": 40.0,
+                     "waist_yaw": 200.0}  # [N m/rad]  # fmt: skip
+        damping = {**FirmWaistG1.control.damping, "hip": 2.0, "hip_roll": 2.0, "knee": 4.0, "ankle": 2.0,
+                   "waist_yaw": 5.0}  # [N m s/rad]  # fmt: skip
         action_scale = {**SCALE, "hip": 0.25, "knee": 0.25, "ankle": 0.31, "waist": 0.1, "waist_yaw": 0.1}  # [ours]
 
     class rewards(LeggedRobotCfg.rewards):
@@ -62,13 +69,6 @@ class UprightG1(G1, LeggedRobotCfg):
 
     class exam(LeggedRobotCfg.exam):
         peer = "g1"
-
-
-class FirmWaistG1(G1):
-    class control(G1.control):  # [UL: with [M]'s 28.5 the torso, which topples with 22 N m/rad, leans on the end stop]
-        stiffness = {**G1.control.stiffness, "waist": 200.0}  # [N m/rad]
-        damping = {**G1.control.damping, "waist": 5.0}  # [N m s/rad]
-        action_scale = {**SCALE, "waist": 0.1}
 
 
 class TrackedG1(G1, MotionTrackingCfg):

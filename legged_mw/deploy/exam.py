@@ -198,9 +198,6 @@ class SwitchStage(DeployStage):
         other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
-        # stiffness and damping (D,), of the second and the first policy
-        pairs = ((other.stiffness, self.contract.stiffness), (other.damping, self.contract.damping))
-        self._gains = [] if all(np.array_equal(*pair) for pair in pairs) else pairs
         self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) True while the second policy runs
         self._standing = np.zeros(num_worlds, dtype=int)  # (N,) control periods since the robot stands
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
@@ -209,8 +206,10 @@ class SwitchStage(DeployStage):
         self._take(commands)
         self._seen, rescued = self.measured, self.rescued[:, None]
         targets = self.controller.act(self._seen, self._commands), self.rescuer.act(self._seen, self._none)
-        if self._gains:
-            self.fleet.set_gains(*(np.where(rescued, *pair) for pair in self._gains))
+        first, second = self.contract, self.rescuer.contract
+        if first.motors.law == "servo":  # else the gains are equal
+            gains = (second.stiffness, first.stiffness), (second.damping, first.damping)
+            self.fleet.set_gains(*(np.where(rescued, *pair) for pair in gains))
         self.fleet.write(np.where(rescued, targets[1], targets[0]))
         self.measured = self.fleet.read()
         broken = self.fleet.broken | ~np.isfinite(self.fleet.qvel).all(axis=1)

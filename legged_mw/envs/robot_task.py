@@ -614,13 +614,17 @@ class RobotTask(BaseTask):
             level = posed(robot.physics, robot.pose).xmat[self.trunk].reshape(3, 3)
             self.trunk_up = self._tensor(level[2]).expand(self.num_envs, 3)  # vertical in its frame, default pose
         if "torque_limits" in on:
-            limited = bool(np.isfinite(robot.effort_range).any())
-            require(limited, "torque_limits", "no joint has a force limit; write asset.effort")
+            self._need_force_limits("torque_limits")
             self.soft_effort = self._tensor(robot.effort_range.T * rewards.soft_torque_limit)  # (2, D) low, high [N m]
         if "dof_vel_limits" in on:
             limited = bool(np.isfinite(robot.speed_limits).any())
             require(limited, "dof_vel_limits", "no joint has a highest speed; write asset.joint_speed_limits")
             self.soft_speed = self._tensor(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
+
+    def _need_force_limits(self, term: str) -> None:
+        """Raise ConfigError if no joint has a force limit, of which ``term`` takes shares."""
+        limited = bool(np.isfinite(self.robot.effort_range).any())
+        require(limited, term, "no joint has a force limit; write asset.effort")
 
     def _joints_called(self, wanted: list[str], field: str) -> Tensor:
         """Indices of the joints that match ``wanted`` (patterns or parts of names), without held joints."""

@@ -63,7 +63,8 @@ def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple
         for _ in range(_TRIES):
             state[7:] = own.uniform(low, high)
             data.qpos = state
-            mujoco.mj_fwdPosition(model, data)  # in the air: it touches itself alone
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)  # in the air: it touches itself alone
             if data.contact.dist[: data.ncon].min(initial=0.0) > -DEPTH:
                 break
         state[2] += CLEAR - (data.geom_xpos[touching, 2] - model.geom_rbound[touching]).min()

@@ -237,4 +237,5 @@ class Getup(RobotTask):
 
     def _reward_stand_torques(self) -> Tensor:
         """Mean square of the torques as shares of their limits, while it is up. [ours]"""
+        self._need_force_limits("stand_torques")
         return self._standing() * (self.torques / self.highest_torque).square().mean(dim=1)
